@@ -1,0 +1,175 @@
+"""The tables of the report: cost models, counts, and every measurement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from reports import number_text
+from reports.recommendation import Setting
+from reports.run_folder import RunFolder, StageModel, Timed, frame_medians_ms
+from tuning.measurement import Measurement
+from vtfs.parameters import PARAMETERS, Value
+
+# What each count means, in the order in which work arises.
+COUNT_MEANINGS = {
+    "samples": "valid view samples",
+    "cells_total": "tiles or cells of the grid",
+    "clusters_occupied": "cells that hold a sample",
+    "light_cluster_pairs": "entries of all light lists",
+    "tree_tests": "tests of nodes of the light tree",
+    "leaf_tests": "tests of single lights",
+    "lighting_computations": "one light evaluated for one sample",
+    "lighting_computations_tile_area": "the same as tile area times list length (2011 paper)",
+    "test_and_set": "existing nodes or samples tested against a triangle",
+    "extra_plane_tests": "tests of the extra planes",
+    "bytes_moved": "bytes read and written",
+    "memory": "bytes held",
+    "divergence": "32 times the longest list of each run of 32 samples",
+    "dropped_at_cap": "lights lost at a cap per cell",
+}
+
+
+@dataclass(frozen=True)
+class CountRow:
+    """One count for every technique; `least` is its smallest value, which the others are compared with."""
+
+    name: str
+    meaning: str
+    values: tuple[float | None, ...]
+
+    @property
+    def least(self) -> float | None:
+        return min((value for value in self.values if value), default=None)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of the table of measurements.
+
+    - `sort_key`: what a click on the header sorts by; None comes last in both directions.
+    """
+
+    text: str
+    sort_key: float | str | None
+    is_number: bool = False
+    is_code: bool = False
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement. `message` says why it failed."""
+
+    cells: tuple[Cell, ...]
+    outcome: str
+    message: str
+    is_best: bool
+
+
+@dataclass(frozen=True)
+class MeasurementTable:
+    """Every measurement.
+
+    - `headers`: label and what it means; `constant`: parameters that never changed, which need no column.
+    """
+
+    headers: tuple[tuple[str, str, bool], ...]
+    rows: tuple[Row, ...]
+    constant: tuple[Setting, ...]
+
+
+def cost_model_groups(run: RunFolder) -> dict[str, list[StageModel]]:
+    """The stage models of each technique, in the order of the file."""
+    groups: dict[str, list[StageModel]] = {}
+    for model in run.cost_models:
+        groups.setdefault(model.technique, []).append(model)
+    return groups
+
+
+def count_rows(run: RunFolder) -> tuple[CountRow, ...]:
+    """One row a count that any technique has; known ones first, in the order of the work."""
+    known = list(COUNT_MEANINGS)
+
+    def place(name: str) -> tuple[int, str]:
+        stem = name.split()[0]
+        return (known.index(stem) if stem in known else len(known), "")
+
+    found = dict.fromkeys(name for counts in run.counts.values() for name in counts)
+    return tuple(
+        CountRow(name, COUNT_MEANINGS.get(name.split()[0], ""), tuple(counts.get(name) for counts in run.counts.values()))
+        for name in sorted(found, key=place)
+    )
+
+
+def measurement_table(run: RunFolder) -> MeasurementTable:
+    """Every line of `measurements.jsonl`, in the order of measuring."""
+    varying, constant = _split_parameters(run.measurements)
+    headers = (
+        ("#", "order of measuring", True),
+        ("technique", "", False),
+        *((name, _meaning(name), _is_numeric(run.measurements, name)) for name in varying),
+        ("slowest frame, ms", "median over the repeats of the slowest of the measured frames", True),
+        ("mean, ms", "mean over the measured frames of their medians", True),
+        ("error", "RMSE over RMS of the float64 reference image", True),
+        ("lighting computations", "lights times samples, on the frame with the most", True),
+        ("compile, s", "time to compile the programs of this configuration", True),
+        ("outcome", "", False),
+    )
+    rows = tuple(_row(number, line, varying, run.best) for number, line in enumerate(run.measurements, 1))
+    return MeasurementTable(headers, rows, constant)
+
+
+def _row(number: int, line: Measurement, varying: list[str], best: Timed | None) -> Row:
+    medians_ms = frame_medians_ms(line)
+    slowest_ms = max(medians_ms, default=None)
+    mean_ms = sum(medians_ms) / len(medians_ms) if medians_ms else None
+    computations = line.counts[0].get("lighting_computations") if line.counts else None
+    cells = (
+        Cell(str(number), number, is_number=True),
+        Cell(line.technique, line.technique, is_code=True),
+        *(_parameter_cell(line.params.get(name)) for name in varying),
+        _number_cell(slowest_ms, number_text.digits),
+        _number_cell(mean_ms, number_text.digits),
+        _number_cell(line.error, number_text.error),
+        _number_cell(computations, number_text.count),
+        _number_cell(line.compile_s, lambda value: f"{value:.1f}"),
+        Cell(line.outcome.replace("_", " "), line.outcome),
+    )
+    return Row(
+        cells=cells,
+        outcome=line.outcome,
+        message=line.message if line.outcome != "timed" else "",
+        is_best=best is not None and best.is_configuration(line.technique, line.params),
+    )
+
+
+def _number_cell(value, text) -> Cell:
+    return Cell("–" if value is None else text(value), value, is_number=True)
+
+
+def _parameter_cell(value: Value | None) -> Cell:
+    if value is None:
+        return Cell("", None)
+    is_number = isinstance(value, int | float)
+    return Cell(f"{value:g}" if is_number else str(value), value if is_number else str(value), is_number, not is_number)
+
+
+def _split_parameters(lines: tuple[Measurement, ...]) -> tuple[list[str], tuple[Setting, ...]]:
+    """Parameters that took several values, and those that never changed wherever a technique has them."""
+    names = dict.fromkeys(PARAMETERS)
+    names |= dict.fromkeys(name for line in lines for name in line.params)
+    varying, constant = [], []
+    for name in names:
+        values = list(dict.fromkeys(line.params[name] for line in lines if name in line.params))
+        if len(values) > 1:
+            varying.append(name)
+        elif values:
+            constant.append(Setting(name, values[0], PARAMETERS[name].default if name in PARAMETERS else None))
+    return varying, tuple(constant)
+
+
+def _is_numeric(lines: tuple[Measurement, ...], name: str) -> bool:
+    return all(isinstance(line.params[name], int | float) for line in lines if name in line.params)
+
+
+def _meaning(name: str) -> str:
+    return PARAMETERS[name].meaning if name in PARAMETERS else ""

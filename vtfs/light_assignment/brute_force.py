@@ -1,0 +1,50 @@
+"""Every light against every cluster: O(M N), and the fastest for a few hundred lights."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from vtfs.bit_lists import WORD_BITS, gather_hits
+from vtfs.bounds import Aabb, Sphere, sphere_meets_box
+from vtfs.clusters import Clusters
+from vtfs.light_lists import AssignCounts, LightLists, lists_from_pairs
+from vtfs.wide_tree import in_leaf_nodes, n_leaf_nodes
+
+
+def assign_brute_force(
+    lights: Sphere, clusters: Clusters, capacity: int, chunk: int
+) -> tuple[LightLists, AssignCounts]:
+    """Test all pairs, 32 lights a word (Olsson and Assarsson 2011; van Oosten 2017, Alg. 8.4).
+
+    Lights are listed in ascending order.
+    """
+    n_lights = lights.x_m.shape[0]
+    n_words = n_leaf_nodes(n_lights, WORD_BITS)
+    x_m = in_leaf_nodes(lights.x_m, WORD_BITS, jnp.inf)
+    y_m, z_m, radius_m = (in_leaf_nodes(c, WORD_BITS, 0.0) for c in (lights.y_m, lights.z_m, lights.radius_m))
+
+    def test(row):
+        cluster, word = row // n_words, row % n_words
+        sphere = Sphere(x_m[word], y_m[word], z_m[word], radius_m[word])
+        return sphere_meets_box(sphere, box_rows(clusters.box, cluster))
+
+    def emit(row, bit):
+        return row // n_words, row % n_words * WORD_BITS + bit
+
+    n_rows = clusters.n_clusters * n_words
+    (cluster, light), total = gather_hits(n_rows, test, emit, 2, capacity, chunk)
+    lists = lists_from_pairs(cluster, light, total, total > capacity, clusters.key.shape[0])
+    none = jnp.zeros(0, jnp.int32)
+    return lists, AssignCounts(none, none, n_rows, clusters.n_clusters)
+
+
+def box_rows(box: Aabb, row) -> Aabb:
+    """Some boxes as a column, to broadcast against each one's candidates."""
+    return Aabb(
+        box.low_x_m[row][:, None],
+        box.low_y_m[row][:, None],
+        box.low_z_m[row][:, None],
+        box.high_x_m[row][:, None],
+        box.high_y_m[row][:, None],
+        box.high_z_m[row][:, None],
+    )

@@ -1,0 +1,149 @@
+"""Shading: Blinn-Phong under lights that end at their range, in linear HDR."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, UInt32
+
+from vtfs.clusters import Clusters
+from vtfs.gbuffer import RUN, GBuffer
+from vtfs.light_lists import POINT_COLUMNS, LightLists
+
+MIN_DISTANCE2_M2 = 1e-4
+_TINY = 1e-30  # keeps 0 / 0 away; far below any product of lengths that matters
+
+Image = tuple[Float[Array, "runs 32"], ...]
+
+
+class Surface(eqx.Module):
+    """What is lit: components apart, any shapes that broadcast with the lights' columns."""
+
+    position_m: tuple[Float[Array, "*s"], ...]
+    normal: tuple[Float[Array, "*s"], ...]
+    base_colour: tuple[Float[Array, "*s"], ...]
+    specular: Float[Array, "*s"]
+    shininess: Float[Array, "*s"]
+
+
+def reflected(
+    surface: Surface, light: Float[Array, "*l columns"], light_cutoff: Float[Array, ""]
+) -> tuple[Float[Array, "*s"], ...]:
+    """Light that a surface reflects towards the eye, from one light each: red, green, blue.
+
+    `colour * falloff * max(0, n.l) * (base + specular * max(0, n.h)**shininess)`, Blinn (1977), with
+    `falloff = max(0, 1 - (d/range)**4)**2 / max(d**2, 1e-4)`. Black where the window (the numerator) is not
+    above `light_cutoff`. Any float precision.
+
+    **Arguments:**
+
+    - `light`: rows of `ViewLights`; the leading axes broadcast against the surface.
+    """
+    x_m, y_m, z_m = surface.position_m
+    n_x, n_y, n_z = surface.normal
+    to_x, to_y, to_z = light[..., 0] - x_m, light[..., 1] - y_m, light[..., 2] - z_m
+    distance2 = to_x * to_x + to_y * to_y + to_z * to_z
+    distance = jnp.sqrt(distance2)
+    ratio2 = distance2 * light[..., 3] * light[..., 3]
+    falloff = jnp.maximum(0, 1 - ratio2 * ratio2) ** 2
+    falloff = jnp.where(falloff > light_cutoff, falloff, 0)
+    n_dot_to = jnp.maximum(n_x * to_x + n_y * to_y + n_z * to_z, 0)
+    # One division for the light's direction and its distance.
+    lit = falloff * n_dot_to / (distance * jnp.maximum(distance2, MIN_DISTANCE2_M2) + _TINY)
+    # The eye is the origin: h = l / |l| - p / |p|, here times |l|. Only its angle counts, so that the
+    # one root of |h| is spared: (n.h / |h|)**s = ((n.h)**2 / h.h)**(s / 2).
+    eye = distance * jax.lax.rsqrt(x_m * x_m + y_m * y_m + z_m * z_m + _TINY)
+    h_x, h_y, h_z = to_x - x_m * eye, to_y - y_m * eye, to_z - z_m * eye
+    n_dot_h = jnp.maximum(n_x * h_x + n_y * h_y + n_z * h_z, 0)
+    cos2 = jnp.maximum(n_dot_h * n_dot_h / (h_x * h_x + h_y * h_y + h_z * h_z + _TINY), _TINY)
+    gloss = surface.specular * jnp.exp2(surface.shininess * 0.5 * jnp.log2(cos2))
+    if light.shape[-1] > POINT_COLUMNS:
+        along = -(to_x * light[..., 8] + to_y * light[..., 9] + to_z * light[..., 10])
+        cos_cone = along / (distance + _TINY)
+        lit = lit * jnp.clip((cos_cone - light[..., 12]) * light[..., 11], 0, 1)
+    return tuple(
+        lit * light[..., 4 + c] * (base + gloss) for c, base in enumerate(surface.base_colour)
+    )
+
+
+def chunk_blocks(capacity: int, batch: int) -> int:
+    """Blocks shaded at once: `batch` counts samples, 0 means all."""
+    return min(capacity, max(1, batch // RUN)) if batch else capacity
+
+
+def longest_first(count: Int[Array, " blocks"], n_blocks: Int[Array, ""]) -> Int[Array, " blocks"]:
+    """Blocks in order of the lengths of their lists, so that a chunk's lists are about equally long.
+
+    Length and block are packed in one word: XLA on a CPU sorts pairs six times slower. Very long lists
+    count as equal.
+    """
+    capacity = count.shape[0]
+    block_bits = max(1, (capacity - 1).bit_length())
+    longest = (1 << (32 - block_bits)) - 2
+    block = jnp.arange(capacity, dtype=jnp.uint32)
+    shortness = longest - jnp.minimum(count, longest).astype(jnp.uint32)
+    shortness = jnp.where(block < n_blocks.astype(jnp.uint32), shortness, jnp.uint32(longest + 1))
+    word: UInt32[Array, " blocks"] = jnp.sort((shortness << block_bits) | block)
+    return (word & jnp.uint32((1 << block_bits) - 1)).astype(jnp.int32)
+
+
+def shade(
+    gbuffer: GBuffer,
+    clusters: Clusters,
+    lists: LightLists,
+    light_rows: Float[Array, "lights columns"],
+    light_cutoff: Float[Array, ""],
+    batch: int,
+) -> Image:
+    """Shade every valid sample with its cluster's lights: linear red, green and blue, 0 where invalid.
+
+    Blocks are shaded in chunks, those with the longest lists first; a chunk takes as many steps as its
+    longest list has lights.
+    """
+    capacity = clusters.block_run.shape[0]
+    chunk = chunk_blocks(capacity, batch)
+    block_count = lists.count[clusters.block_cluster]
+    block_offset = lists.offset[clusters.block_cluster]
+    # One chunk needs no order. Padded, so that the last chunk's slice is not moved.
+    order = longest_first(block_count, clusters.n_blocks) if chunk < capacity else jnp.arange(capacity)
+    order = jnp.pad(order, (0, chunk - 1)).astype(jnp.int32)
+
+    def shade_chunk(state):
+        first, image = state
+        block = jax.lax.dynamic_slice(order, (first,), (chunk,))
+        in_use = first + jnp.arange(chunk, dtype=jnp.int32) < clusters.n_blocks
+        run = clusters.block_run[block]
+        offset, count = block_offset[block], jnp.where(in_use, block_count[block], 0)
+        part = jax.tree.map(lambda channel: channel[run], gbuffer)
+
+        def add_light(state):
+            k, sums = state
+            light = light_rows[lists.index[offset + k]][:, None, :]
+            # Narrow channels are widened here and not before the loop: they are read at every step.
+            surface = Surface(
+                (part.positions.x_m, part.positions.y_m, part.positions.z_m),
+                tuple(n.astype(jnp.float32) for n in part.normal),
+                tuple(c.astype(jnp.float32) for c in part.base_colour),
+                part.specular.astype(jnp.float32),
+                part.shininess.astype(jnp.float32),
+            )
+            listed = (k < count)[:, None]
+            added = reflected(surface, light, light_cutoff)
+            return k + 1, tuple(s + jnp.where(listed, a, 0) for s, a in zip(sums, added, strict=True))
+
+        sums = tuple(e.astype(jnp.float32) for e in part.emissive)
+        longest = jnp.max(count)
+        _, sums = jax.lax.while_loop(lambda state: state[0] < longest, add_light, (jnp.int32(0), sums))
+        image = tuple(
+            jax.lax.dynamic_update_slice(channel, s, (first, 0)) for channel, s in zip(image, sums, strict=True)
+        )
+        return first + chunk, image
+
+    blank = tuple(jnp.zeros((capacity + chunk - 1, RUN), jnp.float32) for _ in range(3))
+    _, image = jax.lax.while_loop(
+        lambda state: state[0] < jnp.minimum(clusters.n_blocks, capacity), shade_chunk, (jnp.int32(0), blank)
+    )
+    place = jnp.zeros(capacity, jnp.int32).at[order[:capacity]].set(jnp.arange(capacity, dtype=jnp.int32))
+    pixel = place[clusters.block_of_sample] * RUN + jnp.arange(RUN, dtype=jnp.int32)
+    return tuple(jnp.where(gbuffer.positions.valid, channel.reshape(-1)[pixel], 0) for channel in image)
