@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from reports.page import render_report, write_report
     from reports.run_folder import RunFolder, read_run_folder
 
-# In the order in which data flows.
 _ROOMS = {
     "RunFolder": "reports.run_folder",
     "read_run_folder": "reports.run_folder",
@@ -20,7 +19,7 @@ _ROOMS = {
     "write_report": "reports.page",
 }
 
-__all__ = ["RunFolder", "read_run_folder", "render_report", "write_report"]  # noqa: RUF022  # the order of the flow
+__all__ = ["RunFolder", "read_run_folder", "render_report", "write_report"]
 
 
 def __getattr__(name: str) -> Any:

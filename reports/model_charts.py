@@ -71,7 +71,7 @@ def time_along_parameters(run: RunFolder) -> go.Figure | None:
     figure = make_subplots(
         rows=rows,
         cols=columns,
-        shared_yaxes="all",
+        shared_yaxes=True,
         vertical_spacing=0.32 / rows,
         horizontal_spacing=0.04,
         subplot_titles=[f"<b>{name}</b>" for name in names],

@@ -11,7 +11,10 @@ _SPACE = "\u00a0"
 
 
 def digits(value: float) -> str:
-    """Three significant digits without an exponent; thousands apart."""
+    """Three significant digits without an exponent; from 1,000 on all that stand before the point."""
+    if abs(value) >= 999.5:
+        return f"{value:,.0f}"
+    value = float(f"{value:.3g}")  # first, since 99.96 has one digit more when it is rounded
     if value == 0:
         return "0"
     decimals = max(0, 2 - math.floor(math.log10(abs(value))))
@@ -28,6 +31,10 @@ def seconds(value: float | None) -> str:
 
 def ratio(value: float) -> str:
     return f"{value:.2f}×"
+
+
+def ratios(low: float, high: float) -> str:
+    return f"{low:.2f} to {high:.2f}"
 
 
 def count(value: float | None) -> str:

@@ -47,18 +47,24 @@ def render_report(run: RunFolder) -> str:
     """
     pictures = read_pictures(run.path / "pictures", run.quoted("pictures") or [])
     figures = {name: draw(run) for name, draw in _CHARTS.items()}
-    return _environment().get_template("report.html").render(
-        run=run,
-        recommendation=recommend(run),
-        pictures=pictures,
-        heat_scale=heat_scale(pictures, run.quoted("heat_scale") or {}),
-        # Both are made by plotly, which escapes what could end a script element.
-        charts={name: None if figure is None else Markup(chart_html(figure, name)) for name, figure in figures.items()},
-        plotly_js=Markup(get_plotlyjs()),
-        beyond_the_chart=beyond_the_chart(run),
-        cost_models=cost_model_groups(run),
-        count_rows=count_rows(run),
-        table=measurement_table(run),
+    return (
+        _environment()
+        .get_template("report.html")
+        .render(
+            run=run,
+            recommendation=recommend(run),
+            pictures=pictures,
+            heat_scale=heat_scale(pictures, run.quoted("heat_scale") or {}),
+            # Both are made by plotly, which escapes what could end a script element.
+            charts={
+                name: None if figure is None else Markup(chart_html(figure, name)) for name, figure in figures.items()
+            },
+            plotly_js=Markup(get_plotlyjs()),
+            beyond_the_chart=beyond_the_chart(run),
+            cost_models=cost_model_groups(run),
+            count_rows=count_rows(run),
+            table=measurement_table(run),
+        )
     )
 
 
@@ -85,6 +91,7 @@ def _environment() -> jinja2.Environment:
         comparison=comparison,
         in_stage_order=in_stage_order,
         interval=number_text.interval,
+        ratios=number_text.ratios,
         setting_text=setting_text,
         technique_colour=technique_colour,
     )

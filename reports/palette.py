@@ -8,7 +8,6 @@ FONT = '"Segoe UI", -apple-system, BlinkMacSystemFont, "Helvetica Neue", "Libera
 INK = "#17212b"
 QUIET_INK = "#55606c"
 RULE = "#d9dee2"
-ACCENT = "#0b6b60"
 
 # Told apart by readers who do not see red and green alike, and at least 3:1 against white.
 _COLOURS = {

@@ -11,8 +11,8 @@ from typing import Any
 
 from vtfs.input_error import InputError
 
-# The ramp of the heat maps where `result.json` does not bring its own: matplotlib's `inferno`, nine stops.
-HEAT_COLOURS = ("#000004", "#210c4a", "#57106e", "#8a226a", "#bc3754", "#e45a31", "#f98e09", "#f9cb35", "#fcffa4")
+# The ramp of `vtfs.image.heat_map`, for where `result.json` does not bring its own.
+HEAT_COLOURS = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from reports import number_text
-from reports.run_folder import RunFolder, Timed
+from reports.run_folder import Gain, RunFolder, Timed
 from vtfs.parameters import PARAMETERS, TECHNIQUES, Value
 
 CLAIM = "for this JAX implementation on this device; nothing is rasterised: frame times start at view samples"
@@ -33,12 +33,14 @@ class Recommendation:
 
     - `verdict`: `tuned`: use `chosen`. `keep_default`: what was found is not faster for certain, so `chosen`
       is a default and `fastest` what was found. `none`: nothing was timed.
+    - `gains`: of what was found, each with what it is over; first the one that decides.
     - `failures`: what went wrong how often, most often first.
     """
 
     verdict: Literal["tuned", "keep_default", "none"]
     chosen: Timed | None
     fastest: Timed | None
+    gains: tuple[tuple[Gain, str], ...]
     settings: tuple[Setting, ...]
     failures: tuple[tuple[str, int], ...]
     claim: str
@@ -54,7 +56,9 @@ class Recommendation:
     @property
     def has_error(self) -> bool:
         """True where the image is not that of the reference, which the sentence must then say."""
-        return self.chosen is not None and self.chosen.error is not None and self.chosen.error >= number_text.EXACT_BELOW
+        return (
+            self.chosen is not None and self.chosen.error is not None and self.chosen.error >= number_text.EXACT_BELOW
+        )
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,7 @@ def recommend(run: RunFolder) -> Recommendation:
         verdict=verdict,
         chosen=chosen,
         fastest=run.best,
+        gains=_gains(run),
         settings=settings(chosen.technique, chosen.params) if chosen else (),
         failures=tuple((outcome.replace("_", " "), n) for outcome, n in outcomes.most_common()),
         claim=str(run.quoted("claim") or CLAIM).rstrip("."),
@@ -89,10 +94,22 @@ def _verdict(run: RunFolder) -> tuple[Literal["tuned", "keep_default", "none"], 
     if run.best is None:
         return "none", None
     default = run.fastest_default or run.default
-    gains = (run.gain_over_default, run.gain_over_fastest_default)
-    if default is not None and any(gain.inside_noise for gain in gains if gain):
+    if default is not None and any(gain.inside_noise for gain, _ in _gains(run)):
         return "keep_default", default
     return "tuned", run.best
+
+
+def _gains(run: RunFolder) -> tuple[tuple[Gain, str], ...]:
+    """One inside the noise first, else the one over the technique's own default."""
+    own, fastest = run.gain_over_default, run.gain_over_fastest_default
+    technique = run.fastest_default.technique if run.fastest_default else ""
+    gains = []
+    if own and run.best and technique == run.best.technique:
+        gains = [(own, "its defaults, the fastest of all defaults")]
+    else:
+        gains += [(own, "its own defaults")] if own else []
+        gains += [(fastest, f"the fastest default{', that of ' + technique if technique else ''}")] if fastest else []
+    return tuple(sorted(gains, key=lambda gain: not gain[0].inside_noise))
 
 
 def comparison(run: RunFolder) -> tuple[Bar, ...]:
@@ -125,5 +142,9 @@ def settings(technique: str, params: Mapping[str, Value]) -> tuple[Setting, ...]
 
 def setting_text(technique: str, params: Mapping[str, Value]) -> str:
     """A configuration in one line: what is not at its default."""
-    changed = [f"{setting.name}={number_text.setting(setting.value)}" for setting in settings(technique, params) if setting.changed]
+    changed = [
+        f"{setting.name}={number_text.setting(setting.value)}"
+        for setting in settings(technique, params)
+        if setting.changed
+    ]
     return " ".join([technique, *changed]) if changed else f"{technique}, defaults"

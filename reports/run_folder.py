@@ -10,11 +10,12 @@ import json
 import math
 import statistics
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from tuning.measurement import Measurement, Outcome
+from tuning.measurement import Measurement
+from tuning.record import read_measurements
 from vtfs.input_error import InputError
 from vtfs.parameters import Value
 
@@ -98,15 +99,32 @@ class StageModel:
 
 
 @dataclass(frozen=True)
+class Scene:
+    """What was rendered. None, or empty, where `result.json` does not say.
+
+    - `measured_frames`: places on the camera path, the frame with the most work first.
+    """
+
+    name: str
+    key: str
+    n_triangles: float | None
+    n_lights: float | None
+    n_frames: float | None
+    viewport_px: tuple[float, ...]
+    measured_frames: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class RunFolder:
     """`result.json` and `measurements.jsonl` of one run, as records.
 
-    - `result`: the whole of `result.json`, for what is only quoted (scene, device, versions, command).
+    - `result`: the whole of `result.json`, for what is only quoted (device, versions, command).
     - `counts`: technique, count, value. `stages_ms`: technique, stage, median.
     """
 
     path: Path
     result: dict[str, Any]
+    scene: Scene
     default: Timed | None
     fastest_default: Timed | None
     best: Timed | None
@@ -143,7 +161,8 @@ def frame_medians_ms(measurement: Measurement) -> tuple[float, ...]:
     """Median over the repeats of the fused frame, for each frame; empty where it was not timed."""
     if measurement.outcome != "timed":
         return ()
-    return tuple(statistics.median(repeats) for repeats in measurement.stages_ms.get("frame", ()) if repeats)
+    frames = [[ms for ms in repeats if math.isfinite(ms)] for repeats in measurement.stages_ms.get("frame", ())]
+    return tuple(statistics.median(repeats) for repeats in frames if repeats)
 
 
 def read_run_folder(folder: Path | str) -> RunFolder:
@@ -160,6 +179,7 @@ def read_run_folder(folder: Path | str) -> RunFolder:
     return RunFolder(
         path=folder,
         result=result,
+        scene=_scene(_record(result, "scene")),
         default=_timed_or_none(result, "default"),
         fastest_default=_timed_or_none(result, "fastest_default"),
         best=_timed_or_none(result, "best"),
@@ -173,29 +193,8 @@ def read_run_folder(folder: Path | str) -> RunFolder:
         predictions=tuple(made for item, at in _records(result, "predictions") if (made := _prediction(item, at))),
         counts=_table(result, "counts"),
         stages_ms=_table(result, "stages"),
-        measurements=read_measurements(folder / "measurements.jsonl"),
+        measurements=tuple(read_measurements(folder / "measurements.jsonl")),
     )
-
-
-def read_measurements(path: Path) -> tuple[Measurement, ...]:
-    """Every measurement of the file, in its order.
-
-    A last line that is not complete is left out: a run that was killed while writing leaves one.
-
-    **Raises:** `InputError` for a missing file, or a damaged line that is not the last.
-    """
-    lines = _read(path).split(b"\n")
-    lines = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
-    measurements = []
-    for number, line in lines:
-        try:
-            record = json.loads(line)
-        except ValueError:
-            if number == lines[-1][0]:
-                break
-            raise InputError(f"{path}:{number}: not JSON; remove this line, or run `vtfs tune` again.") from None
-        measurements.append(_measurement(record, f"{path}:{number}"))
-    return tuple(measurements)
 
 
 def _read(path: Path) -> bytes:
@@ -210,52 +209,31 @@ def _read(path: Path) -> bytes:
 def _read_result(path: Path) -> dict[str, Any]:
     try:
         result = json.loads(_read(path))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: damaged ({error}); run `vtfs tune` again.") from None
     if not isinstance(result, dict):
         raise InputError(f"{path}: holds {_kind(result)}; it must be an object.")
     if result.get("schema") != SCHEMA:
         raise InputError(f"{path}: `schema` is {result.get('schema')!r}; this version of vtfs reads {SCHEMA}.")
-    for key in ("scene", "versions"):
+    # What is only quoted is checked here; the rest where its record is made.
+    for key in ("space_size", "compiled_programs", "compile_s", "wall_s", "max_error"):
+        _number(result, key, "")
+    for key in ("versions", "heat_scale"):
         _record(result, key)
     _records(result, "pictures")
-    _record(result, "heat_scale")
     return result
 
 
-def _measurement(record: object, where: str) -> Measurement:
-    if not isinstance(record, dict):
-        raise InputError(f"{where}: holds {_kind(record)}; a measurement is an object.")
-    names = [field.name for field in fields(Measurement)]
-    given: dict[str, Any] = {name: record[name] for name in names if name in record}
-    missing = [name for name in names if name not in given and name not in ("message", "schema", "error_p999")]
-    if missing:
-        raise InputError(f"{where}: `{missing[0]}` is missing; a measurement has {', '.join(names)}.")
-    given.setdefault("error_p999", None)
-    if given["outcome"] not in get_args(Outcome):
-        raise InputError(
-            f"{where}: `outcome` is {given['outcome']!r}; it must be one of {', '.join(get_args(Outcome))}."
-        )
-    _text(given, "technique", where)
-    for key in ("params", "stages_ms", "versions"):
-        if not isinstance(given[key], dict):
-            raise InputError(f"{where}: `{key}` is {_kind(given[key])}; it must be an object.")
-    given["error"] = _number(given, "error", where)
-    given["compile_s"] = _number(given, "compile_s", where) or 0.0
-    given["message"] = str(given.get("message") or "")
-    try:
-        given["stages_ms"] = {
-            str(stage): tuple(tuple(float(repeat) for repeat in repeats) for repeats in frames)
-            for stage, frames in given["stages_ms"].items()
-        }
-        given["frames"] = tuple(int(frame) for frame in given["frames"])
-        given["counts"] = tuple(dict(record) for record in given["counts"])
-    except (TypeError, ValueError):
-        raise InputError(
-            f"{where}: `stages_ms` must be {{stage: [[repeats] per frame]}}, `frames` a list of whole numbers and "
-            "`counts` one object a frame."
-        ) from None
-    return Measurement(**given)
+def _scene(item: dict[str, Any]) -> Scene:
+    return Scene(
+        name=str(item.get("name") or ""),
+        key=str(item.get("key") or ""),
+        n_triangles=_number(item, "triangles", "scene"),
+        n_lights=_number(item, "lights", "scene"),
+        n_frames=_number(item, "frames", "scene"),
+        viewport_px=_list_of_numbers(item, "viewport", "scene"),
+        measured_frames=_list_of_numbers(item, "measured_frames", "scene"),
+    )
 
 
 def _timed_or_none(result: dict[str, Any], key: str) -> Timed | None:
@@ -269,7 +247,7 @@ def _timed(item: dict[str, Any], at: str) -> Timed | None:
         return None
     return Timed(
         technique=_text(item, "technique", at),
-        params=_record(item, "params", at),
+        params=_params(item, at),
         time_ms=time_ms,
         interval_ms=_interval(item, "time_ms_interval", at),
         error=_number(item, "error", at),
@@ -288,7 +266,7 @@ def _prediction(item: dict[str, Any], at: str) -> Prediction | None:
     low_ms, high_ms = _number(item, "low_ms", at), _number(item, "high_ms", at)
     return Prediction(
         technique=_text(item, "technique", at),
-        params=_record(item, "params", at),
+        params=_params(item, at),
         predicted_ms=predicted_ms,
         interval_ms=None if low_ms is None or high_ms is None else (low_ms, high_ms),
         measured_ms=_number(item, "measured_ms", at),
@@ -311,6 +289,14 @@ def _stage_model(item: dict[str, Any], at: str) -> StageModel:
         constant_loo_error=_number(item, "constant_loo_error", at),
         n_runs=None if n_runs is None else int(n_runs),
     )
+
+
+def _params(item: dict[str, Any], at: str) -> dict[str, Value]:
+    params = _record(item, "params", at)
+    for name, value in params.items():
+        if not isinstance(value, int | float | str):
+            raise InputError(f"result.json: `{at}.params.{name}` is {_kind(value)}; it must be a number or text.")
+    return params
 
 
 def _table(result: dict[str, Any], key: str) -> dict[str, dict[str, float]]:
@@ -355,7 +341,7 @@ def _record(item: dict[str, Any], key: str, at: str = "") -> dict[str, Any]:
 def _text(item: Mapping[str, Any], key: str, at: str) -> str:
     value = item.get(key)
     if not isinstance(value, str):
-        raise InputError(f"{_file_of(at)}: `{_path(at, key)}` is {_kind(value)}; it must be text.")
+        raise InputError(f"result.json: `{at}.{key}` is {_kind(value)}; it must be text.")
     return value
 
 
@@ -365,8 +351,18 @@ def _number(item: Mapping[str, Any], key: str, at: str) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{_file_of(at)}: `{_path(at, key)}` is {_kind(value)}; it must be a number.")
+        raise InputError(f"result.json: `{f'{at}.{key}' if at else key}` is {_kind(value)}; it must be a number.")
     return float(value) if math.isfinite(value) else None
+
+
+def _list_of_numbers(item: Mapping[str, Any], key: str, at: str) -> tuple[float, ...]:
+    value = item.get(key)
+    if value is None:
+        return ()
+    if not isinstance(value, list):
+        raise InputError(f"result.json: `{at}.{key}` is {_kind(value)}; it must be a list of numbers.")
+    found = [_number({key: entry}, key, at) for entry in value]
+    return tuple(entry for entry in found if entry is not None)
 
 
 def _interval(item: Mapping[str, Any], key: str, at: str) -> Interval | None:
@@ -378,15 +374,6 @@ def _interval(item: Mapping[str, Any], key: str, at: str) -> Interval | None:
     low = _number({"low": value[0]}, "low", f"{at}.{key}")
     high = _number({"high": value[1]}, "high", f"{at}.{key}")
     return None if low is None or high is None else (low, high)
-
-
-def _file_of(at: str) -> str:
-    """Records of measurements.jsonl say where they are as `file:line`; the rest is in result.json."""
-    return at if ".jsonl:" in at else "result.json"
-
-
-def _path(at: str, key: str) -> str:
-    return key if ".jsonl:" in at else f"{at}.{key}"
 
 
 def _kind(value: object) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from reports import number_text
@@ -95,7 +96,9 @@ def count_rows(run: RunFolder) -> tuple[CountRow, ...]:
 
     found = dict.fromkeys(name for counts in run.counts.values() for name in counts)
     return tuple(
-        CountRow(name, COUNT_MEANINGS.get(name.split()[0], ""), tuple(counts.get(name) for counts in run.counts.values()))
+        CountRow(
+            name, COUNT_MEANINGS.get(name.split()[0], ""), tuple(counts.get(name) for counts in run.counts.values())
+        )
         for name in sorted(found, key=place)
     )
 
@@ -131,7 +134,7 @@ def _row(number: int, line: Measurement, varying: list[str], best: Timed | None)
         _number_cell(mean_ms, number_text.digits),
         _number_cell(line.error, number_text.error),
         _number_cell(computations, number_text.count),
-        _number_cell(line.compile_s, lambda value: f"{value:.1f}"),
+        _number_cell(line.compile_s if math.isfinite(line.compile_s) else None, lambda value: f"{value:.1f}"),
         Cell(line.outcome.replace("_", " "), line.outcome),
     )
     return Row(

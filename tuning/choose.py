@@ -110,7 +110,8 @@ def choose_next(
     prediction, as wide as the model's left-out error: an uncertain prediction is worth a look. The neighbour is
     there for what counts do not show, such as caches that a batch fits in.
 
-    Stops where the expected gain is within the noise: half the interval of the fastest, at least `SMALLEST_GAIN`.
+    Stops where the expected gain is within the noise: the standard error of the fastest (its 95 % interval is taken
+    for 1.96 of it on either side), at least `SMALLEST_GAIN`.
 
     **Arguments:**
 
@@ -123,7 +124,7 @@ def choose_next(
     fastest = min(timed, key=lambda candidate: time_ms(timed[candidate], objective))
     best_ms = time_ms(timed[fastest], objective)
     low_ms, high_ms = time_interval_ms(timed[fastest], objective)
-    noise = max((high_ms - low_ms) / 2 / best_ms, SMALLEST_GAIN)
+    noise = max((high_ms - low_ms) / (2 * 1.96) / best_ms, SMALLEST_GAIN)
 
     done = {work_done(candidate, counts_of(candidate)) for candidate in measured}
     gains: dict[Configuration, float] = {}

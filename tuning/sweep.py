@@ -297,7 +297,7 @@ class _Run:
         if max_error is None:
             found = self.fastest(filter(_is_exact, timed))
             if found is None:
-                raise InputError("max-error is missing, and no exact setting could be timed; say what error is allowed.")
+                raise InputError("max-error is missing and no exact setting could be timed; say what error is allowed.")
             return found
         errors = {c: m.error for c, m in timed.items() if m.error is not None}
         found = self.fastest(c for c, error in errors.items() if error <= max_error)

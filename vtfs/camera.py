@@ -155,9 +155,7 @@ class CameraPath:
 
     def camera(self, i: int) -> Camera:
         pose = self.poses[i]
-        return Camera(
-            pose.eye_m, pose.target_m, pose.up, self.fov_y_deg, self.near_m, self.far_m, self.viewport
-        )
+        return Camera(pose.eye_m, pose.target_m, pose.up, self.fov_y_deg, self.near_m, self.far_m, self.viewport)
 
     def resized(self, viewport: Viewport) -> CameraPath:
         """The same path for another image; the vertical angle stays."""
@@ -203,8 +201,7 @@ def save_cameras(path: Path | str, camera_path: CameraPath) -> None:
         "near": camera_path.near_m,
         "far": camera_path.far_m if math.isfinite(camera_path.far_m) else None,
         "frames": [
-            {"eye": list(pose.eye_m), "target": list(pose.target_m), "up": list(pose.up)}
-            for pose in camera_path.poses
+            {"eye": list(pose.eye_m), "target": list(pose.target_m), "up": list(pose.up)} for pose in camera_path.poses
         ],
     }
     write_atomically(path, json.dumps(record, indent=1).encode())

@@ -172,7 +172,7 @@ def scatter_lights(
 
     **Raises:** `InputError` for a negative number of lights.
     """
-    from scipy.spatial import cKDTree  # a quarter of a second to import
+    from scipy.spatial import KDTree  # a quarter of a second to import
 
     if n_lights < 0:
         raise InputError(f"`lights` = {n_lights}: must be 0 or more.")
@@ -194,8 +194,8 @@ def scatter_lights(
     if len(samples_m) > 4096:  # a median needs no more
         samples_m = samples_m[rng.choice(len(samples_m), 4096, replace=False)]
     rank = min(lights_per_sample, n_lights)
-    distance_m, _ = cKDTree(position_m).query(samples_m, k=[rank])
-    range_m = float(np.median(distance_m))
+    distance_m, _ = KDTree(position_m).query(samples_m, k=rank)
+    range_m = float(np.median(np.reshape(distance_m, (len(samples_m), rank))[:, -1]))
     peak = 2.0 / rank * range_m**2
     return point_lights(position_m, np.full(n_lights, range_m), peak * _hues(rng.uniform(0, 1, n_lights)))
 
@@ -251,7 +251,9 @@ def _light(line: int, cells: dict[str, str]) -> tuple[float, ...]:
     if not 0 < outer_deg <= 180:
         raise InputError(f"line {line}: column `outer_deg` = {outer_deg:g}: must be above 0 and at most 180.")
     if not 0 <= inner_deg <= outer_deg:
-        raise InputError(f"line {line}: column `inner_deg` = {inner_deg:g}: must be from 0 to outer_deg = {outer_deg:g}.")
+        raise InputError(
+            f"line {line}: column `inner_deg` = {inner_deg:g}: must be from 0 to outer_deg = {outer_deg:g}."
+        )
     return (*base, dx / length, dy / length, dz / length, *cone_cosines(inner_deg, outer_deg))
 
 

@@ -40,7 +40,7 @@ class Parameter:
         """
         try:
             parsed = _as_type(value, type(self.default))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             parsed = None
         if parsed is None or not self._holds(parsed):
             raise InputError(f"parameter `{self.name}` = {value!r}: must be {self.allowed}.")

@@ -83,7 +83,7 @@ class Scene:
         if self.triangles.min() < 0 or self.triangles.max() >= len(self.vertices_m):
             wrong = self.triangles.max() if self.triangles.min() >= 0 else self.triangles.min()
             raise InputError(
-                f"scene `{self.name}`: triangle index {wrong} is out of range; there are {len(self.vertices_m)} vertices."
+                f"scene `{self.name}`: triangle index {wrong} is out of range; has {len(self.vertices_m)} vertices."
             )
         # Embree and the device see float32; what overflows there is no scene.
         largest = float(np.abs(self.vertices_m).max())
@@ -163,17 +163,15 @@ def load_scene(path: Path | str) -> Scene:
 def save_scene(scene: Scene, path: Path | str) -> None:
     """Write a scene as GLB (materials, alpha images, cameras, lights), OBJ (with its MTL beside it) or PLY.
 
-    Coordinates become float32 in GLB and PLY. OBJ and PLY keep colours to 8 bits, and neither alpha images, cameras nor
-    lights.
+    Coordinates become float32 in GLB and PLY. OBJ and PLY keep neither cameras nor lights, PLY only the base colours,
+    in 8 bits.
 
     **Raises:** `InputError` for another suffix, or where the file cannot be written.
     """
     path = Path(path)
-    from vtfs import gltf, mesh_files
+    from vtfs import scene_writing  # it knows `Scene`, and loads trimesh
 
-    savers = {".glb": gltf.save_glb, ".obj": mesh_files.save_obj, ".ply": mesh_files.save_ply}
+    savers = {".glb": scene_writing.save_glb, ".obj": scene_writing.save_obj, ".ply": scene_writing.save_ply}
     if path.suffix.lower() not in savers:
         raise InputError(f"{path}: cannot write `{path.suffix}`; use one of {', '.join(savers)}.")
     savers[path.suffix.lower()](scene, path)
-
-

@@ -22,11 +22,11 @@ _LARGEST_IMAGE_PX = 2**26
 _LARGEST_FILE_BYTES = 2**32
 
 
-def read_inside(folder: Path, name: str, field: str) -> bytes:
-    """The bytes of a file that a scene names, relative to the scene's folder.
+def path_inside(folder: Path, name: str, field: str) -> Path:
+    """Where a file is that a scene names relative to its folder; it need not be there.
 
-    **Raises:** `InputError` where the name leads out of the folder (absolute, `..`, a link, another scheme) or where
-    there is no such file. `field` says where the name stood.
+    **Raises:** `InputError` where the name leads out of the folder (absolute, `..`, a link, another scheme). `field`
+    says where the name stood.
     """
     out = f"{field} = {name[:80]!r}: leads out of the scene's folder; put the file beside the scene."
     # Windows paths too: what is refused must not depend on where we run.
@@ -36,12 +36,22 @@ def read_inside(folder: Path, name: str, field: str) -> bytes:
     try:
         if not path.resolve().is_relative_to(folder.resolve()):
             raise InputError(out)
-        if not path.is_file():
-            raise InputError(f"{field} = {name[:80]!r}: no such file in the scene's folder; put it there.")
+        path.is_file()
+    except (OSError, RuntimeError) as error:  # a name that is too long, a loop of links
+        raise InputError(f"{field} = {name[:80]!r}: is no file name that can be read ({error}); rename it.") from None
+    return path
+
+
+def read_inside(folder: Path, name: str, field: str) -> bytes:
+    """The bytes of a file that a scene names. **Raises:** as `path_inside`, and where there is no such file."""
+    path = path_inside(folder, name, field)
+    if not path.is_file():
+        raise InputError(f"{field} = {name[:80]!r}: no such file in the scene's folder; put it there.")
+    try:
         if path.stat().st_size > _LARGEST_FILE_BYTES:
             raise InputError(f"{field} = {name[:80]!r}: is larger than {_LARGEST_FILE_BYTES} bytes; split the scene.")
         return path.read_bytes()
-    except (OSError, RuntimeError) as error:  # a name that is too long, a loop of links, no permission
+    except OSError as error:
         raise InputError(f"{field} = {name[:80]!r}: cannot be read ({error}); check the file.") from None
 
 
@@ -58,14 +68,16 @@ def decode_image(content: bytes, field: str) -> Image:
             image = PIL.Image.open(io.BytesIO(content), formats=("PNG", "JPEG", "WEBP"))  # reads the header only
             if image.width * image.height > _LARGEST_IMAGE_PX:
                 raise InputError(
-                    f"{field}: has {image.width} x {image.height} pixels; at most {_LARGEST_IMAGE_PX} are read, scale it."
+                    f"{field}: has {image.width} x {image.height} pixels; at most {_LARGEST_IMAGE_PX}: scale it."
                 )
             return image.convert("RGBA")
     except InputError:
         raise
     except Exception as error:  # Pillow's decoders raise many kinds for damaged data
         reason = " ".join(str(error).split())[:80]
-        raise InputError(f"{field}: is not a PNG, JPEG or WebP image that can be read ({reason}); export it again.") from None
+        raise InputError(
+            f"{field}: is not a PNG, JPEG or WebP image that can be read ({reason}); export it again."
+        ) from None
 
 
 def mean_linear_colour(image: Image) -> np.ndarray:

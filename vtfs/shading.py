@@ -5,6 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from vtfs.clusters import Clusters
@@ -72,6 +73,30 @@ def chunk_blocks(capacity: int, batch: int) -> int:
     return min(capacity, max(1, batch // RUN)) if batch else capacity
 
 
+def _step_widths(chunk: int, capacity: int) -> tuple[int, ...]:
+    """Widths of the steps of a chunk. Lists of a small part of all blocks, in order, are about equally long;
+    of all at once a few are many times longer than most."""
+    if chunk < capacity:
+        return (chunk,)
+    return tuple(width for width in (chunk, chunk // 4, chunk // 16, chunk // 64) if width)
+
+
+def chunk_work(of_block: np.ndarray, batch: int, capacity: int) -> tuple[int, int]:
+    """Lanes and steps that `shade` takes for blocks with lists of these lengths (host, exact)."""
+    chunk = chunk_blocks(capacity, batch)
+    longest_first = np.zeros(-(-max(len(of_block), 1) // chunk) * chunk + 1, np.int64)
+    longest_first[: len(of_block)] = -np.sort(-of_block)
+    widths = _step_widths(chunk, capacity)
+    lanes = steps = done = 0
+    if len(widths) == 1:
+        steps = int(longest_first[:-1:chunk].sum())
+        return steps * chunk * RUN, steps
+    for width, narrower in zip(widths, (*widths[1:], 0), strict=True):
+        until = max(done, int(longest_first[narrower]))
+        lanes, steps, done = lanes + (until - done) * width * RUN, steps + until - done, until
+    return lanes, steps
+
+
 def longest_first(count: Int[Array, " blocks"], n_blocks: Int[Array, ""]) -> Int[Array, " blocks"]:
     """Blocks in order of the lengths of their lists, so that a chunk's lists are about equally long.
 
@@ -98,24 +123,20 @@ def shade(
 ) -> Image:
     """Shade every valid sample with its cluster's lights: linear red, green and blue, 0 where invalid.
 
-    Blocks are shaded in chunks, those with the longest lists first; a chunk takes as many steps as its
-    longest list has lights.
+    Blocks are shaded in chunks, those with the longest lists first. A step adds one light to every block of
+    the chunk; steps go on with the first quarter once the others are done, and so on.
     """
     capacity = clusters.block_run.shape[0]
     chunk = chunk_blocks(capacity, batch)
     block_count = lists.count[clusters.block_cluster]
     block_offset = lists.offset[clusters.block_cluster]
-    # One chunk needs no order. Padded, so that the last chunk's slice is not moved.
-    order = longest_first(block_count, clusters.n_blocks) if chunk < capacity else jnp.arange(capacity)
-    order = jnp.pad(order, (0, chunk - 1)).astype(jnp.int32)
+    # Padded, so that the last chunk's slice is not moved.
+    order = jnp.pad(longest_first(block_count, clusters.n_blocks), (0, chunk - 1))
+    widths = _step_widths(chunk, capacity)
 
-    def shade_chunk(state):
-        first, image = state
-        block = jax.lax.dynamic_slice(order, (first,), (chunk,))
-        in_use = first + jnp.arange(chunk, dtype=jnp.int32) < clusters.n_blocks
-        run = clusters.block_run[block]
-        offset, count = block_offset[block], jnp.where(in_use, block_count[block], 0)
-        part = jax.tree.map(lambda channel: channel[run], gbuffer)
+    def add_lights(part, offset, count, k, sums, width, until):
+        """Steps `k` to `until` of the first `width` blocks."""
+        part, offset, count = jax.tree.map(lambda channel: channel[:width], (part, offset, count))
 
         def add_light(state):
             k, sums = state
@@ -132,9 +153,21 @@ def shade(
             added = reflected(surface, light, light_cutoff)
             return k + 1, tuple(s + jnp.where(listed, a, 0) for s, a in zip(sums, added, strict=True))
 
+        first_sums = tuple(s[:width] for s in sums)
+        k, first_sums = jax.lax.while_loop(lambda state: state[0] < until, add_light, (k, first_sums))
+        return k, tuple(s.at[:width].set(first) for s, first in zip(sums, first_sums, strict=True))
+
+    def shade_chunk(state):
+        first, image = state
+        block = jax.lax.dynamic_slice(order, (first,), (chunk,))
+        in_use = first + jnp.arange(chunk, dtype=jnp.int32) < clusters.n_blocks
+        run = clusters.block_run[block]
+        offset, count = block_offset[block], jnp.where(in_use, block_count[block], 0)
+        part = jax.tree.map(lambda channel: channel[run], gbuffer)
         sums = tuple(e.astype(jnp.float32) for e in part.emissive)
-        longest = jnp.max(count)
-        _, sums = jax.lax.while_loop(lambda state: state[0] < longest, add_light, (jnp.int32(0), sums))
+        k = jnp.int32(0)
+        for width, narrower in zip(widths, (*widths[1:], 0), strict=True):
+            k, sums = add_lights(part, offset, count, k, sums, width, count[narrower])
         image = tuple(
             jax.lax.dynamic_update_slice(channel, s, (first, 0)) for channel, s in zip(image, sums, strict=True)
         )

@@ -9,13 +9,11 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
-import os
 import zipfile
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -24,11 +22,11 @@ from vtfs.camera import Camera
 from vtfs.files import write_atomically
 from vtfs.input_error import InputError
 from vtfs.scene import Material, Scene
+from vtfs.tracer import Planes, Tracer, by_bands, pixel_rays
 
 log = logging.getLogger("vtfs.view_samples")
 
 _VERSION = 1  # of the rule by which a pixel gets its triangle; part of the cache key
-_LARGEST_LAYERS = 4096  # alpha-tested surfaces that one ray may step through
 _FLAT = ("specular", "shininess", "triangle", "valid")
 
 
@@ -58,7 +56,9 @@ class ViewSamples:
         for field in fields(self)[1:]:
             shape = (height, width) if field.name in _FLAT else (height, width, 3)
             if getattr(self, field.name).shape != shape:
-                raise InputError(f"view samples `{field.name}` has shape {getattr(self, field.name).shape}, not {shape}.")
+                raise InputError(
+                    f"view samples `{field.name}` has shape {getattr(self, field.name).shape}, not {shape}."
+                )
 
     @property
     def n_valid(self) -> int:
@@ -78,102 +78,6 @@ class ViewSamples:
         return (self.position_m[self.valid].astype(np.float64) - matrix[:3, 3]) @ matrix[:3, :3]
 
 
-class Tracer:
-    """A scene in Embree, built once for all frames of a path.
-
-    Embree sees float32 coordinates relative to the centre of the scene. Triangles of `blend` materials are left out:
-    view samples are the opaque layer.
-    """
-
-    def __init__(self, scene: Scene):
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
-        self.scene = scene
-        low, high = scene.bounds_m
-        self._centre_m = (low + high) / 2
-        blended = np.array([material.alpha_mode == "blend" for material in scene.materials])
-        masked = np.array([material.alpha_mode == "mask" for material in scene.materials])
-        self._is_masked = masked[scene.material_index]
-        # Embree's primitive numbers count opaque triangles only.
-        self._triangle_of = np.flatnonzero(~blended[scene.material_index]).astype(np.int32)
-        self._embree = EmbreeScene(robust=True)
-        self._is_empty = len(self._triangle_of) == 0
-        if not self._is_empty:
-            vertices = (scene.vertices_m - self._centre_m).astype(np.float32)
-            TriangleMesh(self._embree, vertices, scene.triangles[self._triangle_of])
-            self._embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # the first query builds it
-
-    def first_hits(self, origin_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nearest triangle of each ray, alpha tests not applied.
-
-        **Arguments:** world-space float64 `[N, 3]`; directions of any length.
-
-        **Returns:** int32 triangle indices, -1 for none, and float32 parameters along the rays.
-        """
-        if self._is_empty or len(origin_m) == 0:
-            return np.full(len(origin_m), -1, np.int32), np.full(len(origin_m), np.inf, np.float32)
-        hits = self._embree.run(
-            np.ascontiguousarray(origin_m - self._centre_m, np.float32),
-            np.ascontiguousarray(direction, np.float32),
-            output=True,
-        )
-        primitive = hits["primID"]
-        return np.where(primitive >= 0, self._triangle_of[primitive], -1), hits["tfar"]
-
-    def hit_distances_m(self, origin_m: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Distance to the first surface along unit directions; infinite where there is none. float64 `[N]`."""
-        triangle, distance_m = self.first_hits(origin_m, direction)
-        return np.where(triangle >= 0, distance_m.astype(np.float64), np.inf)
-
-    def triangles(self, camera: Camera) -> np.ndarray:
-        """The triangle that each pixel sees, int32 `[h, w]`, -1 for none.
-
-        Rays start at the near plane, as a rasteriser clips there.
-        """
-        planes = _Planes(self.scene, camera)
-        seen = np.empty((camera.viewport.height_px, camera.viewport.width_px), np.int32)
-
-        def trace(rows: slice) -> None:
-            x, y = _slopes(camera, rows)
-            seen[rows] = self._visible(planes, camera, x, y).reshape(-1, seen.shape[1])
-
-        _by_bands(camera, trace)
-        return seen
-
-    def _visible(self, planes: _Planes, camera: Camera, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Triangles on rays of slopes `x`, `y`, float64 `[N]`, alpha tests applied."""
-        right, up, backward = camera.view_from_world[:3, :3]
-        direction = x[:, None] * right + y[:, None] * up - backward
-        eye_m = np.asarray(camera.eye_m, np.float64)
-        triangle, _ = self.first_hits(eye_m + camera.near_m * direction, direction)
-        ray = np.flatnonzero(self._is_masked[triangle] & (triangle >= 0))
-        depth_m = np.zeros(len(ray))
-        # The first step past a surface: some float32 roundings of the coordinates that Embree sees.
-        resolution_m = 4 * float(np.finfo(np.float32).eps) * (self.scene.diagonal_m + camera.near_m)
-        step_m = np.full(len(ray), resolution_m)
-        last = np.full(len(ray), -1, np.int32)
-        for _ in range(_LARGEST_LAYERS):
-            hit = triangle[ray]
-            is_again = hit == last
-            # Hit again by rounding: go twice as far as before. Else start from the surface just found.
-            step_m = np.where(is_again, 2 * step_m, resolution_m)
-            at_m = planes.depth_m(hit, x[ray], y[ray])
-            is_opaque = np.zeros(len(ray), bool)
-            is_tested = (hit >= 0) & ~is_again
-            is_opaque[is_tested] = planes.is_opaque(hit[is_tested], x[ray[is_tested]], y[ray[is_tested]])
-            is_opaque[is_tested] |= ~self._is_masked[hit[is_tested]]
-            goes_on = (hit >= 0) & ~is_opaque
-            depth_m = np.maximum(np.where(is_again, depth_m, at_m), depth_m) + step_m
-            ray, depth_m, step_m, last = ray[goes_on], depth_m[goes_on], step_m[goes_on], hit[goes_on]
-            if len(ray) == 0:
-                return triangle
-            triangle[ray], _ = self.first_hits(eye_m + depth_m[:, None] * direction[ray], direction[ray])
-        log.warning("%d rays met more than %d transparent surfaces; they see nothing", len(ray), _LARGEST_LAYERS)
-        triangle[ray] = -1
-        return triangle
-
-
 def trace_view_samples(scene: Scene, camera: Camera, tracer: Tracer | None = None) -> ViewSamples:
     """What each pixel of a view sees.
 
@@ -182,141 +86,64 @@ def trace_view_samples(scene: Scene, camera: Camera, tracer: Tracer | None = Non
     """
     cached = cache_dir() / "view_samples" / f"{_cache_key(scene, camera)}.npy"
     triangle = _read_cached(cached, camera, scene.n_triangles)
+    planes = Planes(scene, camera)
     if triangle is None:
-        triangle = (tracer or Tracer(scene)).triangles(camera)
+        triangle = (tracer or Tracer(scene)).triangles(camera, planes)
         try:
             _write_cached(cached, triangle)
         except InputError as error:  # a cache that cannot be written costs time, not the result
             log.warning("view samples are not cached: %s", error)
-    return _samples_from(scene, camera, triangle)
+    return _samples_from(planes, camera, triangle)
 
 
-class _Planes:
-    """The triangles of a scene in view space, float64: where the ray of a pixel meets their planes."""
-
-    def __init__(self, scene: Scene, camera: Camera):
-        matrix = camera.view_from_world
-        vertices = scene.vertices_m @ matrix[:3, :3].T + matrix[:3, 3]
-        self.scene = scene
-        self.v0, v1, v2 = (vertices[scene.triangles[:, corner]] for corner in range(3))
-        self.edge1, self.edge2 = v1 - self.v0, v2 - self.v0
-        self.normal = np.cross(self.edge1, self.edge2)
-        self.offset = (self.normal * self.v0).sum(axis=1)
-        depths = -np.stack([self.v0[:, 2], v1[:, 2], v2[:, 2]])
-        self.low_m, self.high_m = depths.min(axis=0), depths.max(axis=0)
-
-    def depth_m(self, triangle: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Distance along -z at which rays `(x, y, -1)` meet the planes of triangles.
-
-        A plane seen edge-on has no answer, or a far one: the triangle's own range of depths bounds it.
-        """
-        normal = self.normal[triangle]
-        along = normal[:, 0] * x + normal[:, 1] * y - normal[:, 2]
-        low_m = self.low_m[triangle]
-        depth_m = np.divide(self.offset[triangle], along, out=low_m.copy(), where=along != 0)
-        return np.clip(depth_m, low_m, self.high_m[triangle])
-
-    def is_opaque(self, triangle: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Alpha test of alpha-tested triangles where rays meet them; `triangle` may be any, bool `[N]`."""
-        opaque = np.ones(len(triangle), bool)
-        index = self.scene.material_index[triangle]
-        for m in np.unique(index):
-            material = self.scene.materials[m]
-            if material.alpha_mode != "mask":
-                continue
-            here = index == m
-            if material.alpha_image is None or self.scene.uv is None:
-                opaque[here] = material.opacity >= material.alpha_cutoff
-            else:
-                u, v = self._uv(triangle[here], x[here], y[here])
-                opaque[here] = material.opacity * _bilinear(material.alpha_image, u, v) >= material.alpha_cutoff
-        return opaque
-
-    def _uv(self, triangle: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Texture coordinates where rays meet triangles, float64 `[N]` each."""
-        assert self.scene.uv is not None
-        depth_m = self.depth_m(triangle, x, y)
-        from_v0 = np.stack([x * depth_m, y * depth_m, -depth_m], axis=1) - self.v0[triangle]
-        normal = self.normal[triangle]
-        squared = np.maximum((normal * normal).sum(axis=1), np.finfo(np.float64).tiny)
-        b1 = (np.cross(from_v0, self.edge2[triangle]) * normal).sum(axis=1) / squared
-        b2 = (np.cross(self.edge1[triangle], from_v0) * normal).sum(axis=1) / squared
-        b1 = np.clip(b1, 0, 1)  # the pixel's centre may lie outside by Embree's rounding
-        b2 = np.clip(b2, 0, 1 - b1)
-        uv0, uv1, uv2 = (self.scene.uv[self.scene.triangles[triangle, k]].astype(np.float64) for k in range(3))
-        uv = uv0 + b1[:, None] * (uv1 - uv0) + b2[:, None] * (uv2 - uv0)
-        return uv[:, 0], uv[:, 1]
-
-
-def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """An image at texture coordinates, repeated; texel centres lie at `(i + 1/2) / n`."""
-    height, width = image.shape
-    column, row = (u % 1.0) * width - 0.5, (v % 1.0) * height - 0.5
-    left, above = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
-    s, t = column - left, row - above
-    upper = image[above % height, left % width] * (1 - s) + image[above % height, (left + 1) % width] * s
-    lower = image[(above + 1) % height, left % width] * (1 - s) + image[(above + 1) % height, (left + 1) % width] * s
-    return upper * (1 - t) + lower * t
-
-
-def _samples_from(scene: Scene, camera: Camera, triangle: np.ndarray) -> ViewSamples:
+def _samples_from(planes: Planes, camera: Camera, triangle: np.ndarray) -> ViewSamples:
     """Positions, normals and materials of the triangles that pixels see."""
-    planes = _Planes(scene, camera)
     height, width = triangle.shape
-    vectors = {name: np.zeros((height, width, 3), np.float32) for name in ("position_m", "normal", "base_colour", "emissive")}
-    numbers = {name: np.zeros((height, width), np.float32) for name in ("specular", "shininess")}
-    valid = np.zeros((height, width), bool)
-    table = {name: _material_table(scene.materials, name) for name in ("base_colour", "emissive", "specular", "shininess")}
+    position, normal, base_colour, emissive = (np.empty((height, width, 3), np.float32) for _ in range(4))
+    specular, shininess = (np.empty((height, width), np.float32) for _ in range(2))
+    valid = np.empty((height, width), bool)
+    looks = _looks(planes.scene.materials)
 
     def fill(rows: slice) -> None:
-        x, y = _slopes(camera, rows)
-        at = np.flatnonzero(triangle[rows].ravel() >= 0)
-        seen, x, y = triangle[rows].ravel()[at], x[at], y[at]
+        x, y = pixel_rays(camera, rows)
+        is_hit = triangle[rows].ravel() >= 0
+        seen = np.maximum(triangle[rows].ravel(), 0)  # what is not there is any triangle, and cleared below
         depth_m = planes.depth_m(seen, x, y)
-        valid[rows].reshape(-1)[at] = (depth_m >= camera.near_m) & (depth_m <= camera.far_m)
-        position = vectors["position_m"][rows].reshape(-1, 3)
-        position[at] = np.stack([x * depth_m, y * depth_m, -depth_m], axis=1)
-        vectors["normal"][rows].reshape(-1, 3)[at] = _facing_normals(planes.normal[seen], x, y)
-        material = scene.material_index[seen]
-        for name in ("base_colour", "emissive"):
-            vectors[name][rows].reshape(-1, 3)[at] = table[name][material]
-        for name in ("specular", "shininess"):
-            numbers[name][rows].reshape(-1)[at] = table[name][material]
+        valid[rows] = (is_hit & (depth_m >= camera.near_m) & (depth_m <= camera.far_m)).reshape(-1, width)
+        facing = _facing_normals(planes.row[seen], x, y)
+        look = looks[planes.scene.material_index[seen]]
+        for values, result in (
+            (np.stack([x * depth_m, y * depth_m, -depth_m], axis=1), position),
+            (facing, normal),
+            (look[:, 0:3], base_colour),
+            (look[:, 3:6], emissive),
+            (look[:, 6], specular),
+            (look[:, 7], shininess),
+        ):
+            band = result[rows].reshape(values.shape)
+            band[...] = values
+            band[~is_hit] = 0
 
-    _by_bands(camera, fill)
-    return ViewSamples(camera=camera, triangle=triangle, valid=valid, **vectors, **numbers)
+    by_bands(camera, fill)
+    return ViewSamples(camera, position, normal, base_colour, specular, shininess, emissive, triangle, valid)
 
 
-def _facing_normals(normal: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _looks(materials: tuple[Material, ...]) -> np.ndarray:
+    """One row a material: base colour, emissive, specular, shininess; float32 `[M, 8]`."""
+    return np.array([(*m.base_colour, *m.emissive, m.specular, m.shininess) for m in materials], np.float32)
+
+
+def _facing_normals(row: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Unit normals on the side from which rays `(x, y, -1)` come; the ray's own where a triangle has no area."""
-    along = normal[:, 0] * x + normal[:, 1] * y - normal[:, 2]
-    length = np.sqrt((normal * normal).sum(axis=1))
-    unit = normal * (np.where(along > 0, -1.0, 1.0) / np.maximum(length, np.finfo(np.float64).tiny))[:, None]
-    flat = length <= np.finfo(np.float64).tiny
-    if flat.any():
-        back = np.stack([-x[flat], -y[flat], np.ones(int(flat.sum()))], axis=1)
+    nx, ny, nz = row[:, 0], row[:, 1], row[:, 2]
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    factor = np.where(nx * x + ny * y - nz > 0, -1.0, 1.0) / np.maximum(length, np.finfo(np.float64).tiny)
+    unit = row[:, :3] * factor[:, None]
+    flat = np.flatnonzero(length <= np.finfo(np.float64).tiny)
+    if len(flat):
+        back = np.stack([-x[flat], -y[flat], np.ones(len(flat))], axis=1)
         unit[flat] = back / np.linalg.norm(back, axis=1, keepdims=True)
     return unit
-
-
-def _material_table(materials: tuple[Material, ...], name: str) -> np.ndarray:
-    return np.array([getattr(material, name) for material in materials], np.float32)
-
-
-def _slopes(camera: Camera, rows: slice) -> tuple[np.ndarray, np.ndarray]:
-    """`x / depth` and `y / depth` of the pixels of some rows, float64 `[rows * w]` each."""
-    x, y = camera.pixel_slopes()
-    y = y[rows]
-    return np.tile(x, len(y)), np.repeat(y, len(x))
-
-
-def _by_bands(camera: Camera, work: Callable[[slice], None]) -> None:
-    """Call `work` for bands of rows, on all cores: Embree and large NumPy operations let other threads run."""
-    height, width = camera.viewport.height_px, camera.viewport.width_px
-    n_rows = max(1, 2**16 // width)  # a band's float64 arrays stay in the second-level cache
-    bands = [slice(row, min(row + n_rows, height)) for row in range(0, height, n_rows)]
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) as pool:
-        list(pool.map(work, bands))
 
 
 def _cache_key(scene: Scene, camera: Camera) -> str:
@@ -349,3 +176,154 @@ def _write_cached(path: Path, triangle: np.ndarray) -> None:
     body = io.BytesIO()
     np.save(body, triangle, allow_pickle=False)
     write_atomically(path, body.getvalue() + hashlib.sha256(body.getvalue()).digest())
+
+
+# --- the user's own samples -----------------------------------------------------------------------------------------
+
+
+def save_gbuffer(path: Path | str, samples: ViewSamples) -> None:
+    """Write view samples as the `.npz` that `load_gbuffer` reads.
+
+    **Raises:** `InputError` where the file cannot be written.
+    """
+    arrays = {_KEYS.get(field.name, field.name): getattr(samples, field.name) for field in fields(samples)[1:]}
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    write_atomically(path, content.getvalue())
+
+
+def load_gbuffer(path: Path | str, camera: Camera) -> ViewSamples:
+    """Read the samples of the user's own renderer from an `.npz`, for the camera they were made with.
+
+    Arrays `[h, w, ...]`, row 0 at the top, or with a leading layer axis of length 1:
+
+    - `position` (view space, 3 columns) or `depth` (distance along -z at pixel centres); `normal` (view space, 3) and
+      `base_colour` (linear, 3) are required;
+    - `specular`, `shininess`, `emissive` (3), `primitive` (integers) and `valid` (booleans) are optional: 0.04, 32, 0,
+      0, and "the depth is finite and in [near, far]".
+
+    A position must lie in its own pixel: lights are listed by pixel tile.
+
+    **Raises:** `InputError` that names the file, the key, and what it must be.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the path of a G-buffer as .npz.")
+    try:
+        return _gbuffer(_read_arrays(path, camera), camera)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+_KEYS = {"position_m": "position", "triangle": "primitive"}
+_COLUMNS = {"position": 3, "normal": 3, "base_colour": 3, "emissive": 3} | dict.fromkeys(
+    ("depth", "specular", "shininess", "primitive", "valid"), 0
+)
+_KINDS = {"primitive": ("iu", "integers"), "valid": ("b", "booleans")}
+_SLACK_PX = 0.01  # half-precision positions are off by up to a third of a pixel at 720 rows: those are refused
+
+
+def _read_arrays(path: Path, camera: Camera) -> dict[str, np.ndarray]:
+    """The arrays that we know, each with its header checked before it is read."""
+    height, width = camera.viewport.height_px, camera.viewport.width_px
+    arrays: dict[str, np.ndarray] = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
+            for key, columns in _COLUMNS.items():
+                if key not in names:
+                    continue
+                with archive.open(names[key]) as member:
+                    shape, dtype = _header(member)
+                expected = (height, width) + ((columns,) if columns else ())
+                if shape not in (expected, (1, *expected)):
+                    raise InputError(f"key `{key}`: has shape {shape}; the camera's image needs {expected}.")
+                kinds, words = _KINDS.get(key, ("f", "floats"))
+                if dtype.hasobject or dtype.kind not in kinds:
+                    raise InputError(f"key `{key}`: has dtype {dtype}; must be {words}.")
+                with archive.open(names[key]) as member:
+                    arrays[key] = np.lib.format.read_array(member, allow_pickle=False).reshape(expected)
+    except InputError:
+        raise
+    except Exception as error:  # damaged archives raise many kinds: zip, zlib, struct, value errors
+        reason = " ".join(f"{error}".split())[:80]
+        raise InputError(f"is not an .npz that can be read ({reason}); write it with numpy.savez.") from None
+    return arrays
+
+
+def _header(member: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    version = np.lib.format.read_magic(member)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(member)
+    return shape, dtype
+
+
+def _gbuffer(arrays: dict[str, np.ndarray], camera: Camera) -> ViewSamples:
+    for key in ("normal", "base_colour"):
+        if key not in arrays:
+            raise InputError(f"key `{key}`: is missing; the file has {', '.join(arrays) or 'nothing known'}.")
+    if "position" not in arrays and "depth" not in arrays:
+        raise InputError(f"key `position` or `depth`: is missing; the file has {', '.join(arrays)}.")
+    x, y = camera.pixel_slopes()
+    depth_m = -arrays["position"][..., 2] if "position" in arrays else arrays["depth"]
+    with np.errstate(invalid="ignore"):
+        valid = arrays.get("valid", True) & (depth_m >= camera.near_m) & (depth_m <= camera.far_m)
+        from_depth = np.stack([x * depth_m, y[:, None] * depth_m, -depth_m], axis=-1)
+    shape = valid.shape
+    values = {
+        "position": from_depth,
+        "specular": np.full(shape, 0.04),
+        "shininess": np.full(shape, 32.0),
+        "emissive": np.zeros((*shape, 3)),
+        "primitive": np.zeros(shape, np.int32),
+    } | arrays
+    for key in ("position", "normal", "base_colour", "emissive", "specular", "shininess"):
+        _check_values(key, values[key], valid)
+    _check_pixels(values["position"], valid, camera)
+    length = np.linalg.norm(values["normal"].astype(np.float64), axis=-1)
+    bad = np.argwhere(valid & ~(np.abs(length - 1) < 0.05))
+    if len(bad):
+        row, column = bad[0]
+        raise InputError(f"key `normal` at row {row}, column {column}: has length {length[row, column]:g}; must be 1.")
+    primitive = np.where(valid, values["primitive"], -1)
+    if primitive.max() > np.iinfo(np.int32).max:
+        raise InputError(f"key `primitive`: has {primitive.max()}; must be below 2**31.")
+
+    def kept(key: str) -> np.ndarray:
+        """float32, and 0 where no sample is."""
+        mask = valid[..., None] if values[key].ndim == 3 else valid
+        return np.ascontiguousarray(np.where(mask, values[key], 0), np.float32)
+
+    position, normal, base_colour, emissive = (kept(key) for key in ("position", "normal", "base_colour", "emissive"))
+    normal /= np.where(valid, length, 1)[..., None].astype(np.float32)
+    return ViewSamples(
+        camera, position, normal, base_colour, kept("specular"), kept("shininess"), emissive,
+        primitive.astype(np.int32), valid,
+    )  # fmt: skip
+
+
+def _check_values(key: str, values: np.ndarray, valid: np.ndarray) -> None:
+    """Valid samples hold numbers, and colours no negative ones."""
+    is_signed = key in ("position", "normal")
+    wrong = ~np.isfinite(values) if is_signed else ~(np.isfinite(values) & (values >= 0))
+    bad = np.argwhere(valid & (wrong.any(axis=-1) if values.ndim == 3 else wrong))
+    if len(bad):
+        row, column = bad[0]
+        must = "finite" if is_signed else "finite and 0 or more"
+        raise InputError(f"key `{key}` at row {row}, column {column} = {values[row, column]}: must be {must}.")
+
+
+def _check_pixels(position: np.ndarray, valid: np.ndarray, camera: Camera) -> None:
+    """Every valid position projects into its own pixel."""
+    width, height = camera.viewport.width_px, camera.viewport.height_px
+    with np.errstate(all="ignore"):
+        column = (position[..., 0] / -position[..., 2] / camera.tan_half_x + 1) * width / 2
+        row = (1 - position[..., 1] / -position[..., 2] / camera.tan_half_y) * height / 2
+        off = np.maximum(np.abs(column - np.arange(width) - 0.5), np.abs(row - np.arange(height)[:, None] - 0.5))
+    off = np.where(valid, off, 0)
+    if off.max() > 0.5 + _SLACK_PX:
+        at_row, at_column = np.unravel_index(np.argmax(off), off.shape)
+        raise InputError(
+            f"key `position` at row {at_row}, column {at_column}: projects {off.max():.3g} pixels from its centre; must"
+            " be within half a pixel (is it in view space, y up, looking down -z, and is this the camera?)."
+        )

@@ -170,8 +170,9 @@ def walk(
 
 
 def n_child_tests(
-    node_rows: np.ndarray, short_rows: np.ndarray, n_children: tuple[int, ...], branching: int
+    node_rows: Int[Array, " levels"], short_rows: Int[Array, " levels"], n_children: tuple[int, ...], branching: int
 ) -> int:
     """Tests of existing children: a whole node's for each visit, less what the level's last node lacks."""
-    missing = [-count % branching for count in n_children]
-    return int(sum(int(r) * branching - int(s) * m for r, s, m in zip(node_rows, short_rows, missing, strict=True)))
+    rows, short = np.asarray(node_rows, np.int64), np.asarray(short_rows, np.int64)
+    missing = np.array([-count % branching for count in n_children], np.int64)
+    return int(np.sum(rows * branching - short * missing))

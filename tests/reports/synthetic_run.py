@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from reports.pictures import HEAT_COLOURS
+from vtfs.image import heat_map
 
 Params = dict[str, Any]
 
@@ -148,11 +148,11 @@ def complete_run() -> Files:
         ],
         "claim": "for this JAX implementation on this device; nothing is rasterised: frame times start at view samples",
     }  # fmt: skip
-    top = _heat("tiled_deferred").max()
+    top, everywhere = int(_heat("tiled_deferred").max()), np.ones((HEIGHT_PX, WIDTH_PX), bool)
     pictures = {
         "frame.png": _png(_frame()),
-        "heat_tiled_deferred.png": _png(_coloured(_heat("tiled_deferred") / top)),
-        "heat_volume_tiled_bvh.png": _png(_coloured(_heat("volume_tiled_bvh") / top)),
+        "heat_tiled_deferred.png": _png(heat_map(_heat("tiled_deferred"), top, everywhere)),
+        "heat_volume_tiled_bvh.png": _png(heat_map(_heat("volume_tiled_bvh"), top, everywhere)),
     }
     return Files(result, lines, pictures)
 
@@ -179,16 +179,16 @@ def run_without_times() -> Files:
     files.result.update(dict.fromkeys(("default", "fastest_default", "best", "gain")))
     empty = {"pareto": [], "cost_models": [], "predictions": [], "stages": {}, "counts": {}, "pictures": []}
     files.result.update(empty)
+    files.result["failed"] = len(files.measurements)
     return files
 
 
 def run_of_one() -> Files:
-    """A run that measured one configuration and stopped."""
+    """A run that measured one default and stopped."""
     files = complete_run()
-    timed = files.result["best"]
-    line = next(line for line in files.measurements if line["params"] == timed["params"])
-    files.measurements[:] = [line]
-    changes = {"default": timed, "fastest_default": timed, "pareto": [timed], "predictions": [], "measured": 1}
+    files.measurements[:] = [line for line in files.measurements if line["params"] == _VOLUME_DEFAULT]
+    timed = {**_timed(files.measurements[0]), "error": files.measurements[0]["error"]}
+    changes = {"default": timed, "fastest_default": timed, "best": timed, "pareto": [timed], "predictions": []}
     files.result.update(changes)
     files.result["gain"] = {
         "over_default": 1.0, "over_default_interval": None, "over_fastest_default": 1.0,
@@ -253,7 +253,7 @@ def _stages_ms(technique: str, params: Params) -> dict[str, float]:
         lights = 17 + 1.0 * tile
         return {"clusters": 4.2, "assign": 9.0 + 20_000 / tile**2, "shade_opaque": 1.9e-6 * SAMPLES * lights * scale}
     slices = params["depth_slices"] or 96
-    lights = 11 + 0.8 * tile + 330 / slices
+    lights = 7 + 0.6 * tile + 330 / slices
     clusters = 300 * (32 / tile) ** 1.5 * slices**0.8
     branching = params["branching"]
     return {
@@ -338,10 +338,11 @@ def _cost_models() -> list[dict[str, Any]]:
             "constant_loo_error": constant_loo_error,
         }
 
+    listing = {"fixed_ms": 8.7, "leaf_tests": 6.4e-5}
     shading = {"fixed_ms": 2.1, "lighting_computations": 1.87e-6}
     without = [("samples", 0.061), ("light_cluster_pairs", 0.058)]
     return [
-        model("tiled_deferred", "assign", {"fixed_ms": 8.7, "leaf_tests": 6.4e-5}, [("cells_total", 0.081)], 0.07, 0.9, 24),
+        model("tiled_deferred", "assign", listing, [("cells_total", 0.081)], 0.07, 0.9, 24),
         model("tiled_deferred", "shade_opaque", shading, without, 0.052, 0.44, 24),
         model("volume_tiled_bvh", "clusters", {"fixed_ms": 14.2}, [("clusters_occupied", 0.031)], 0.028, 0.028, 36),
         model(
@@ -369,16 +370,11 @@ def _frame() -> np.ndarray:
     y, x = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX]
     u, v = x / WIDTH_PX - 0.5, y / HEIGHT_PX - 0.5
     light = np.exp(-9 * (u * u + v * v)) + 0.15 * (np.sin(60 * u) > 0.7)
-    return np.clip(np.stack([light, 0.78 * light, 0.55 * light + 0.05], axis=-1), 0, 1)
-
-
-def _coloured(share: np.ndarray) -> np.ndarray:
-    stops = np.array([[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in HEAT_COLOURS])
-    places = np.linspace(0, 1, len(stops))
-    return np.stack([np.interp(share, places, stops[:, channel]) for channel in range(3)], axis=-1)
+    shares = np.stack([light, 0.78 * light, 0.55 * light + 0.05], axis=-1)
+    return (255 * np.clip(shares, 0, 1)).astype(np.uint8)
 
 
 def _png(rgb: np.ndarray) -> bytes:
     buffer = io.BytesIO()
-    Image.fromarray((255 * rgb).astype(np.uint8)).save(buffer, "PNG")
+    Image.fromarray(rgb).save(buffer, "PNG")
     return buffer.getvalue()

@@ -10,7 +10,9 @@ from tuning.measurement import Measurement, Outcome
 from tuning.select import fit_models, fit_stage
 
 
-def measurement(counts, frames_ms, outcome: Outcome = "timed", stage="frame", technique="tiled_deferred") -> Measurement:
+def measurement(
+    counts, frames_ms, outcome: Outcome = "timed", stage="frame", technique="tiled_deferred"
+) -> Measurement:
     return Measurement(
         technique=technique,
         params={},
@@ -29,16 +31,17 @@ def measurement(counts, frames_ms, outcome: Outcome = "timed", stage="frame", te
     )
 
 
+DRAWN = ("cells_total", "clusters_occupied", "tree_tests", "lighting_computations")
+
+
 def made_by(costs, n, seed, noise=0.03, fixed_ms=3.0, outlier=1.0) -> list[Measurement]:
     """Measurements whose times follow a law: all candidate counts of a frame, drawn independently."""
     rng = np.random.default_rng(seed)
     made = []
     for k in range(n):
-        counts = [
-            {name: int(np.exp(rng.uniform(np.log(1e4), np.log(1e7)))) for name in (*STAGE_TERMS["frame"][1:3], "tree_tests")}
-            | {"lighting_computations": int(np.exp(rng.uniform(np.log(1e5), np.log(1e8))))}
-            for _ in range(3)
-        ]
+        drawn = np.exp(rng.uniform(np.log(1e4), np.log(1e7), size=(3, 4)))
+        drawn[:, 3] *= 10
+        counts = [dict(zip(DRAWN, map(int, frame), strict=True)) for frame in drawn]
         times = [fixed_ms + sum(cost * c[name] for name, cost in costs.items()) for c in counts]
         times = [ms * math.exp(noise * rng.normal()) * (outlier if k == 0 else 1.0) for ms in times]
         made.append(measurement(counts, [(ms, ms * 1.01, ms * 0.99) for ms in times]))
@@ -141,7 +144,8 @@ def test_what_failed_or_has_no_sound_time_is_not_fitted():
         measurement(counts, [(math.inf,)] * 3),
         measurement((), [], outcome="failed"),
     ]
-    assert fit_stage([*unsound, *sound, *unsound], "tiled_deferred", "frame") == fit_stage(sound, "tiled_deferred", "frame")
+    model = fit_stage([*unsound, *sound, *unsound], "tiled_deferred", "frame")
+    assert model == fit_stage(sound, "tiled_deferred", "frame")
     assert fit_stage(unsound, "tiled_deferred", "frame") is None
 
 

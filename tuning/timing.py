@@ -1,0 +1,58 @@
+"""Repeating a run until its median is known well enough."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from tuning.choose import median_interval
+
+MIN_REPEATS = 3
+PRECISION = 0.02
+"""Half of what the 95 % interval of the median may span, relative to the median."""
+
+CAP_S = 2.0
+"""Most time spent on one frame, once it has `MIN_REPEATS`."""
+
+
+def timed_ms(run: Callable[[], object]) -> float:
+    """One run. It must return only when its result is there (`block_until_ready`)."""
+    started = time.perf_counter()
+    run()
+    return (time.perf_counter() - started) * 1e3
+
+
+def repeats_ms(
+    run: Callable[[], object], decided: Callable[[tuple[float, float]], bool], cap_s: float = CAP_S
+) -> tuple[float, ...]:
+    """Times of at least three runs after one that warms up.
+
+    More are made until the 95 % interval of the median is within 2 %, or `cap_s` is spent, or the interval
+    already decides what the caller wants to know (a configuration that has lost needs no third digit).
+    """
+    run()
+    times: list[float] = []
+    while True:
+        times.append(timed_ms(run))
+        if len(times) < MIN_REPEATS:
+            continue
+        low, high = median_interval(times)
+        middle = (low + high) / 2
+        precise = len(times) > 2 * MIN_REPEATS - 1 and high - low <= 2 * PRECISION * middle
+        if precise or decided((low, high)) or sum(times) >= cap_s * 1e3:
+            return tuple(times)
+
+
+def interleaved_ms(runs: list[Callable[[], object]], rounds: int, cap_s: float) -> list[tuple[float, ...]]:
+    """Times of several runs taken in turns, so that a drift of the machine's speed meets all of them.
+
+    At least three rounds, then until `rounds` or `cap_s`.
+    """
+    times: list[list[float]] = [[] for _ in runs]
+    started = time.perf_counter()
+    for done in range(rounds):
+        if done >= MIN_REPEATS and time.perf_counter() - started > cap_s:
+            break
+        for run, own in zip(runs, times, strict=True):
+            own.append(timed_ms(run))
+    return [tuple(own) for own in times]

@@ -1,0 +1,257 @@
+"""One scene on one device, as the search sees it: counts, and times that were checked first."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from tuning.choose import Objective
+from tuning.compiles import Compiles
+from tuning.measurement import Measurement, Outcome
+from tuning.timing import interleaved_ms, repeats_ms
+from vtfs.device import device_name, versions
+from vtfs.frame import (
+    NO_SIZES,
+    CapacityError,
+    FrameCounts,
+    FrameInputs,
+    Sizes,
+    count,
+    frame_program,
+    image_on_host,
+    is_listed,
+    narrowed,
+    planned,
+    run_stages,
+    stage_program,
+)
+from vtfs.input_error import InputError
+from vtfs.lights import Lights
+from vtfs.op_counts import OpCounts
+from vtfs.parameters import Configuration
+from vtfs.reference import forward_reference, image_error
+from vtfs.techniques import REGISTRY
+from vtfs.view_samples import ViewSamples
+
+log = logging.getLogger("vtfs.workload")
+
+EXACT_ERROR = 1e-4
+"""Error above which a configuration that should be exact has failed. float32 gives some 1e-5 near a light, where
+the rounding of its position (1e-7 of its distance to the eye) counts against its distance to the sample."""
+
+LOST = 1.1
+"""A configuration this many times as slow as the best so far has lost: its time needs no more repeats."""
+
+TIMEOUT_S = 30.0
+"""A frame that takes longer is recorded as `timeout`, not repeated."""
+
+_STAGE_CAP_S = 0.5  # a stage's repeats feed the cost model; the decision is taken on the whole frame
+_DUEL_CAP_S = 8.0
+
+
+@dataclass(frozen=True)
+class ScenePath:
+    """What is measured: the chosen frames of a scene's camera path.
+
+    - `frames`: their numbers, the one with the most work first; `samples`: of each.
+    """
+
+    key: str
+    frames: tuple[int, ...]
+    samples: tuple[ViewSamples, ...]
+    lights: Lights
+    seed: int
+
+
+class SceneWorkload:
+    """Counts and measures configurations on a few frames. Implements `sweep.Workload`."""
+
+    def __init__(self, path: ScenePath, compiles: Compiles, objective: Objective = "max"):
+        self._path = path
+        self._compiles = compiles
+        self._objective = objective
+        self._inputs = [FrameInputs(samples, path.lights) for samples in path.samples]
+        self._reference: np.ndarray | None = None
+        self._counted: dict[tuple[Configuration, int], FrameCounts] = {}
+        self.device = device_name()
+        self.frames = path.frames
+        self.scene_key = path.key
+
+    def counts(self, config: Configuration, /) -> tuple[OpCounts, ...]:
+        """Counts on the frame with the most work: what decides, and a third of the cost of counting all."""
+        return (self.counts_of_frame(config, 0),)
+
+    def counts_of_frame(self, config: Configuration, i: int) -> OpCounts:
+        # Counting is done once for all values of what does not change a list. Except for the cut-off's last
+        # bits, counts do not depend on the G-buffer's precision either.
+        canonical = config.replaced(batch=0, gbuffer="float32")
+        if (canonical, i) not in self._counted:
+            counted, _ = count(canonical, self._inputs[i])
+            self._counted[canonical, i] = counted
+        return self._counted[canonical, i].at_batch(int(config["batch"]))
+
+    def measure(self, config: Configuration, best_ms: float | None, /) -> Measurement:
+        """Check a configuration against the float64 reference, then time its frame and its stages."""
+        before = self._compiles.copy()
+        outcome, message = "failed", ""
+        taken = _Taken()
+        try:
+            outcome, message = self._take(config, best_ms, taken)
+        except CapacityError as error:
+            outcome, message = "overflow", str(error)
+        except InputError as error:
+            message = str(error)
+        except MemoryError as error:
+            outcome, message = "out_of_memory", str(error) or "the host's memory is full"
+        except jax.errors.JaxRuntimeError as error:
+            outcome = "out_of_memory" if "RESOURCE_EXHAUSTED" in str(error) else "failed"
+            message = str(error).splitlines()[0][:300]
+        if outcome != "timed":
+            log.warning("%s: %s (%s)", config, outcome, message)
+        return Measurement(
+            technique=config.technique,
+            params=config.params,
+            scene_key=self.scene_key,
+            frames=self.frames,
+            seed=self._path.seed,
+            outcome=outcome,
+            compile_s=self._compiles.seconds - before.seconds,
+            stages_ms=taken.stages_ms,
+            counts=taken.counts,
+            error=taken.error,
+            error_p999=taken.error_p999,
+            device=self.device,
+            versions=versions(),
+            load=os.getloadavg()[0],
+            message=message,
+        )
+
+    def duel_ms(self, configs: Sequence[Configuration], frame: int, rounds: int = 15) -> list[tuple[float, ...]]:
+        """Times of configurations that were measured before, on one frame, in turns."""
+        return interleaved_ms([self._frame_run(config, frame) for config in configs], rounds, _DUEL_CAP_S)
+
+    def image(self, config: Configuration) -> np.ndarray:
+        """The linear image of the frame with the most work."""
+        return image_on_host(self._run_frame(config, 0)[0], self._inputs[0])
+
+    def valid(self) -> np.ndarray:
+        """Which pixels of that frame have a sample."""
+        return self._path.samples[0].valid
+
+    def list_lengths(self, config: Configuration) -> np.ndarray:
+        """Lights listed for each pixel of that frame."""
+        return count(config, self._inputs[0])[1].of_sample
+
+    def reference(self) -> np.ndarray:
+        """The float64 image of the frame with the most work."""
+        if self._reference is None:
+            self._reference = forward_reference(self._path.samples[0], self._path.lights)
+        return self._reference
+
+    def _take(self, config: Configuration, best_ms: float | None, taken: _Taken) -> tuple[Outcome, str]:
+        sizes = self._sizes_of(config)
+        taken.counts = tuple(self.counts_of_frame(config, i) for i in range(len(self._inputs)))
+        started = time.perf_counter()
+        image, overflowed = self._run_frame(config, 0)
+        if bool(overflowed):
+            return "overflow", "a frame no longer fits the capacities that its sizing run found"
+        valid = self._path.samples[0].valid
+        taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), self.reference(), valid)
+        exact = config["gbuffer"] == "float32" and config["light_cutoff"] == 0
+        if exact and not taken.error <= EXACT_ERROR:
+            return "failed", f"error {taken.error:.2g} against the float64 reference; float32 explains {EXACT_ERROR:g}"
+        if time.perf_counter() - started > TIMEOUT_S:
+            started = time.perf_counter()
+            jax.block_until_ready(self._run_frame(config, 0))
+            if (seconds := time.perf_counter() - started) > TIMEOUT_S:
+                return "timeout", f"one frame took {seconds:.0f} s, more than {TIMEOUT_S:.0f} s"
+
+        frames: list[tuple[float, ...]] = []
+        slowest_low = 0.0
+        for i in range(len(self._inputs)):
+
+            def decided(interval_ms: tuple[float, float], slowest_low: float = slowest_low) -> bool:
+                lost = best_ms is not None and interval_ms[0] > LOST * best_ms
+                # With `mean` every frame counts; with `max` only the slowest one.
+                return self._objective == "max" and (lost or interval_ms[1] < slowest_low)
+
+            frames.append(repeats_ms(self._frame_run(config, i), decided))
+            slowest_low = max(slowest_low, min(frames[-1]))
+        taken.stages_ms = self._stages_ms(config, sizes) | {"frame": tuple(frames)}
+        return "timed", ""
+
+    def _stages_ms(self, config: Configuration, sizes: Sizes) -> dict[str, tuple[tuple[float, ...], ...]]:
+        stages = REGISTRY[config.technique].stages
+        if len(stages) == 1:  # the frame is that stage
+            return {}
+        times: dict[str, list[tuple[float, ...]]] = {stage.name: [] for stage in stages}
+        for inputs in self._inputs:
+            env, _ = run_stages(config, inputs, sizes)
+            for stage in stages:
+                program = stage_program(stage, narrowed(stage, planned(config, sizes)))
+                arguments = [env[name] for name in stage.needs]
+
+                def run(program: Callable = program, arguments: list = arguments) -> None:
+                    jax.block_until_ready(program(*arguments))
+
+                times[stage.name].append(repeats_ms(run, lambda _: True, _STAGE_CAP_S))
+        return {name: tuple(own) for name, own in times.items()}
+
+    def _sizes_of(self, config: Configuration) -> Sizes:
+        """Capacities that hold all frames: they are measured with the same programs."""
+        if not is_listed(config):
+            return NO_SIZES
+        for i in range(len(self._inputs)):
+            self.counts_of_frame(config, i)
+        canonical = config.replaced(batch=0, gbuffer="float32")
+        sizes = NO_SIZES
+        for i in range(len(self._inputs)):
+            sizes = sizes.covering(self._counted[canonical, i].sizes)
+        return sizes
+
+    def _run_frame(self, config: Configuration, i: int):
+        program = frame_program(config.technique, planned(config, self._sizes_of(config)))
+        return program(self._inputs[i].environment(config))
+
+    def _frame_run(self, config: Configuration, i: int) -> Callable[[], object]:
+        program = frame_program(config.technique, planned(config, self._sizes_of(config)))
+        env = self._inputs[i].environment(config)
+
+        def run() -> None:
+            # Whether it overflowed is read as well: a renderer would have to.
+            image, overflowed = program(env)
+            jax.block_until_ready(image)
+            bool(overflowed)
+
+        return run
+
+
+@dataclass
+class _Taken:
+    """What a measurement has so far: kept where a later step fails."""
+
+    stages_ms: dict[str, tuple[tuple[float, ...], ...]]
+    counts: tuple[OpCounts, ...]
+    error: float | None
+    error_p999: float | None
+
+    def __init__(self):
+        self.stages_ms, self.counts, self.error, self.error_p999 = {}, (), None, None
+
+
+def busiest_frames(work: dict[int, int]) -> tuple[int, ...]:
+    """The frames with the most, the median and the least work, in that order and each once.
+
+    **Arguments:**
+
+    - `work`: lighting computations of each counted frame.
+    """
+    ordered = sorted(work, key=lambda frame: (-work[frame], frame))
+    chosen = (ordered[0], ordered[(len(ordered) - 1) // 2], ordered[-1])
+    return tuple(dict.fromkeys(chosen))

@@ -1,0 +1,91 @@
+"""The float64 reference image: every light on every sample, in NumPy, apart from all code under test."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from vtfs.lights import Lights
+from vtfs.view_samples import ViewSamples
+
+_BOX_PX = 32
+_MIN_DISTANCE2_M2 = 1e-4
+
+
+def forward_reference(samples: ViewSamples, lights: Lights) -> np.ndarray:
+    """The image of `forward` in float64 `[h, w, 3]`; 0 where invalid.
+
+    A light is left out of a box of 32 x 32 pixels only where the box of their positions lies outside its
+    range, where its window is exactly 0; so the sum is that over all lights.
+    """
+    view = lights.relative_to(samples.camera.view_from_world)
+    height, width = samples.valid.shape
+    image = np.zeros((height, width, 3))
+
+    def shade_box(corner: tuple[int, int]) -> None:
+        box = np.s_[corner[0] : corner[0] + _BOX_PX, corner[1] : corner[1] + _BOX_PX]
+        valid = samples.valid[box]
+        if valid.any():
+            image[box][valid] = _shade(samples, box, valid, view)
+
+    corners = [(y, x) for y in range(0, height, _BOX_PX) for x in range(0, width, _BOX_PX)]
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(shade_box, corners))
+    return image
+
+
+def _shade(samples: ViewSamples, box: tuple[slice, slice], valid: np.ndarray, view: Lights) -> np.ndarray:
+    """`[samples, 3]` of the valid samples of a box; see `shading.reflected` for the formula."""
+    position, normal, base, emissive = (
+        channel[box][valid].astype(np.float64)
+        for channel in (samples.position_m, samples.normal, samples.base_colour, samples.emissive)
+    )
+    specular, shininess = (channel[box][valid].astype(np.float64) for channel in (samples.specular, samples.shininess))
+    outside = np.maximum(position.min(0) - view.position_m, view.position_m - position.max(0)).clip(0)
+    reach = np.flatnonzero((outside**2).sum(1) <= view.range_m**2 * (1 + 1e-12))
+    reach = reach[view.range_m[reach] > 0]
+    # Lights first: [lights, samples].
+    to = [view.position_m[reach, c, None] - position[None, :, c] for c in range(3)]
+    distance2 = sum(t * t for t in to)
+    distance = np.sqrt(distance2)
+    window = np.maximum(0, 1 - (distance2 / view.range_m[reach, None] ** 2) ** 2) ** 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        to_unit = [np.nan_to_num(t / distance) for t in to]
+        eye = -position / np.linalg.norm(position, axis=1, keepdims=True)
+        half = [t + eye[None, :, c] for c, t in enumerate(to_unit)]
+        length = np.sqrt(sum(h * h for h in half))
+        n_dot_h = np.nan_to_num(sum(h * normal[None, :, c] for c, h in enumerate(half)) / length).clip(0)
+    n_dot_l = sum(t * normal[None, :, c] for c, t in enumerate(to_unit)).clip(0)
+    along = -sum(t * view.direction[reach, c, None] for c, t in enumerate(to_unit))
+    cos_outer, cos_inner = view.cos_outer[reach, None], view.cos_inner[reach, None]
+    cone = ((along - cos_outer) / (cos_inner - cos_outer)).clip(0, 1)
+    lit = cone * window / np.maximum(distance2, _MIN_DISTANCE2_M2) * n_dot_l
+    gloss = specular * n_dot_h**shininess
+    return np.stack(
+        [
+            emissive[:, c] + (lit * view.colour[reach, c, None] * (base[None, :, c] + gloss)).sum(0)
+            for c in range(3)
+        ],
+        axis=1,
+    )
+
+
+def image_error(image: np.ndarray, reference: np.ndarray, valid: np.ndarray) -> tuple[float, float]:
+    """RMSE and 99.9th percentile of the absolute difference, both over the RMS of the reference.
+
+    Linear HDR before tone mapping, valid pixels only. 0 for a black reference that is met exactly.
+    """
+    if not valid.any():
+        return 0.0, 0.0
+    difference = np.abs(image[valid].astype(np.float64) - reference[valid])
+    rms = float(np.sqrt(np.mean(reference[valid] ** 2))) or 1.0
+    return float(np.sqrt(np.mean(difference**2))) / rms, float(np.percentile(difference, 99.9)) / rms
+
+
+def largest_relative_difference(image: np.ndarray, reference: np.ndarray, valid: np.ndarray) -> float:
+    """`max |a - b| / max(|b|, mean b)`: what "within 1e-4" speaks of."""
+    if not valid.any():
+        return 0.0
+    a, b = image[valid].astype(np.float64), reference[valid]
+    return float(np.max(np.abs(a - b) / np.maximum(np.abs(b), b.mean() or 1.0)))

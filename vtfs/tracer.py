@@ -1,0 +1,223 @@
+"""Primary rays: the triangle that each pixel sees, found by Embree, and where its ray meets that triangle's plane."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from vtfs.camera import Camera
+from vtfs.scene import Scene
+
+log = logging.getLogger("vtfs.view_samples")
+
+_LARGEST_LAYERS = 4096  # alpha-tested surfaces that one ray may step through
+
+
+class Tracer:
+    """A scene in Embree, built once for all frames of a path.
+
+    Embree sees float32 coordinates relative to the centre of the scene. Triangles of `blend` materials are left out:
+    view samples are the opaque layer.
+    """
+
+    def __init__(self, scene: Scene):
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self.scene = scene
+        low, high = scene.bounds_m
+        self._centre_m = (low + high) / 2
+        blended = np.array([material.alpha_mode == "blend" for material in scene.materials])
+        masked = np.array([material.alpha_mode == "mask" for material in scene.materials])
+        self._is_masked = masked[scene.material_index]
+        # Embree's primitive numbers count opaque triangles only.
+        self._triangle_of = np.flatnonzero(~blended[scene.material_index]).astype(np.int32)
+        self._embree = EmbreeScene(robust=True)
+        self._is_empty = len(self._triangle_of) == 0
+        if not self._is_empty:
+            vertices = (scene.vertices_m - self._centre_m).astype(np.float32)
+            TriangleMesh(self._embree, vertices, scene.triangles[self._triangle_of])
+            self._embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # the first query builds it
+
+    def first_hits(self, origin_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Nearest triangle of each ray, alpha tests not applied.
+
+        **Arguments:** world-space float64 `[N, 3]`; directions of any length.
+
+        **Returns:** int32 triangle indices, -1 for none, and float32 parameters along the rays.
+        """
+        if self._is_empty or len(origin_m) == 0:
+            return np.full(len(origin_m), -1, np.int32), np.full(len(origin_m), np.inf, np.float32)
+        hits = self._embree.run(
+            np.ascontiguousarray(origin_m - self._centre_m, np.float32),
+            np.ascontiguousarray(direction, np.float32),
+            output=True,
+        )
+        primitive = hits["primID"]
+        return np.where(primitive >= 0, self._triangle_of[primitive], -1), hits["tfar"]
+
+    def hit_distances_m(self, origin_m: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Distance to the first surface along unit directions; infinite where there is none. float64 `[N]`."""
+        triangle, distance_m = self.first_hits(origin_m, direction)
+        return np.where(triangle >= 0, distance_m.astype(np.float64), np.inf)
+
+    def triangles(self, camera: Camera, planes: Planes | None = None) -> np.ndarray:
+        """The triangle that each pixel sees, int32 `[h, w]`, -1 for none.
+
+        Rays start at the near plane, as a rasteriser clips there. `planes`, if the caller has them already.
+        """
+        found = planes or Planes(self.scene, camera)
+        seen = np.empty((camera.viewport.height_px, camera.viewport.width_px), np.int32)
+
+        def trace(rows: slice) -> None:
+            x, y = pixel_rays(camera, rows)
+            seen[rows] = self._visible(found, camera, x, y).reshape(-1, seen.shape[1])
+
+        by_bands(camera, trace)
+        return seen
+
+    def _visible(self, planes: Planes, camera: Camera, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Triangles on rays of slopes `x`, `y`, float64 `[N]`, alpha tests applied."""
+        right, up, backward = camera.view_from_world[:3, :3]
+        direction = x[:, None] * right + y[:, None] * up - backward
+        eye_m = np.asarray(camera.eye_m, np.float64)
+        triangle, _ = self.first_hits(eye_m + camera.near_m * direction, direction)
+        # Rays that met an alpha-tested surface go on, each from just past it, until none is left.
+        ray = np.flatnonzero(self._is_masked[triangle] & (triangle >= 0))
+        hit, x, y, direction = triangle[ray], x[ray], y[ray], direction[ray]
+        past_m = np.full(len(ray), camera.near_m)
+        # The first step past a surface: some float32 roundings of the coordinates that Embree sees.
+        resolution_m = 4 * float(np.finfo(np.float32).eps) * (self.scene.diagonal_m + camera.near_m)
+        step_m = np.full(len(ray), resolution_m)
+        last = np.full(len(ray), -1, np.int32)
+        for _ in range(_LARGEST_LAYERS):
+            is_again = hit == last  # by rounding: go twice as far as before
+            depth_m = planes.depth_m(hit, x, y)
+            is_there = ~is_again & planes.is_opaque(hit, x, y, depth_m)
+            triangle[ray[is_there]] = hit[is_there]
+            step_m = np.where(is_again, 2 * step_m, resolution_m)
+            past_m = np.maximum(np.where(is_again, past_m, depth_m), past_m) + step_m
+            on = np.flatnonzero(~is_there)
+            ray, x, y, direction, past_m, step_m, last = (
+                values[on] for values in (ray, x, y, direction, past_m, step_m, hit)
+            )
+            hit, _ = self.first_hits(eye_m + past_m[:, None] * direction, direction)
+            triangle[ray[hit < 0]] = -1
+            on = np.flatnonzero(hit >= 0)
+            if len(on) == 0:
+                return triangle
+            ray, x, y, direction, past_m, step_m, last, hit = (
+                values[on] for values in (ray, x, y, direction, past_m, step_m, last, hit)
+            )
+        log.warning("%d rays met more than %d transparent surfaces; they see nothing", len(ray), _LARGEST_LAYERS)
+        triangle[ray] = -1
+        return triangle
+
+
+class Planes:
+    """The triangles of a scene in view space, float64: where the ray of a pixel meets their planes.
+
+    One row a triangle, as pixels gather whole rows: normal (not unit) x, y, z, normal . v0, least and greatest depth.
+    """
+
+    def __init__(self, scene: Scene, camera: Camera):
+        matrix = camera.view_from_world
+        vertices = scene.vertices_m @ matrix[:3, :3].T + matrix[:3, 3]
+        v0, v1, v2 = (vertices[scene.triangles[:, corner]] for corner in range(3))
+        normal = np.cross(v1 - v0, v2 - v0)
+        depths = -np.stack([v0[:, 2], v1[:, 2], v2[:, 2]])
+        offset = (normal * v0).sum(axis=1)
+        self.scene = scene
+        self.row = np.column_stack([normal, offset, depths.min(axis=0), depths.max(axis=0)])
+        masked = np.array([m.alpha_mode == "mask" and m.alpha_image is not None for m in scene.materials])
+        textured = np.flatnonzero(masked[scene.material_index])
+        self._uv_row = np.zeros((0, 8))
+        if scene.uv is not None and len(textured):
+            self._row_of = np.zeros(scene.n_triangles, np.int32)
+            self._row_of[textured] = np.arange(len(textured))
+            corners = (v0[textured], v1[textured], v2[textured])
+            self._uv_row = _uv_rows(corners, normal[textured], scene.uv[scene.triangles[textured]].astype(np.float64))
+
+    def depth_m(self, triangle: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Distance along -z at which rays `(x, y, -1)` meet the planes of triangles.
+
+        A plane seen edge-on has no answer, or a far one: the triangle's own range of depths bounds it.
+        """
+        row = self.row[triangle]
+        along = row[:, 0] * x + row[:, 1] * y - row[:, 2]
+        depth_m = np.divide(row[:, 3], along, out=row[:, 4].copy(), where=along != 0)
+        return np.clip(depth_m, row[:, 4], row[:, 5])
+
+    def is_opaque(self, triangle: np.ndarray, x: np.ndarray, y: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+        """Alpha test where rays meet triangles at given depths, bool `[N]`; without an alpha test it is passed."""
+        opaque = np.ones(len(triangle), bool)
+        index = self.scene.material_index[triangle]
+        for m in np.flatnonzero(np.bincount(index, minlength=len(self.scene.materials))):
+            material = self.scene.materials[m]
+            if material.alpha_mode != "mask":
+                continue
+            here = np.flatnonzero(index == m)
+            if material.alpha_image is None or self.scene.uv is None:
+                opaque[here] = material.opacity >= material.alpha_cutoff
+                continue
+            row = self._uv_row[self._row_of[triangle[here]]]
+            rx, ry, rz = x[here] * depth_m[here], y[here] * depth_m[here], -depth_m[here]
+            u = row[:, 0] * rx + row[:, 1] * ry + row[:, 2] * rz + row[:, 3]
+            v = row[:, 4] * rx + row[:, 5] * ry + row[:, 6] * rz + row[:, 7]
+            opaque[here] = material.opacity * _bilinear(material.alpha_image, u, v) >= material.alpha_cutoff
+        return opaque
+
+
+def _uv_rows(corners: tuple[np.ndarray, np.ndarray, np.ndarray], normal: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Texture coordinates as linear functions of the position: `u = row[0:3] . p + row[3]`, v likewise behind it.
+
+    The barycentric weight of v1 at p is `((p - v0) x e2) . n / n . n = (p - v0) . (e2 x n) / n . n`.
+    """
+    v0, v1, v2 = corners
+    squared = np.maximum((normal * normal).sum(axis=1), np.finfo(np.float64).tiny)[:, None]
+    weight1, weight2 = np.cross(v2 - v0, normal) / squared, np.cross(normal, v1 - v0) / squared
+    rows = np.empty((len(v0), 8))
+    for k in range(2):
+        uv0 = uv[:, 0, k]
+        gradient = (uv[:, 1, k] - uv0)[:, None] * weight1 + (uv[:, 2, k] - uv0)[:, None] * weight2
+        rows[:, 4 * k : 4 * k + 3] = gradient
+        rows[:, 4 * k + 3] = uv0 - (gradient * v0).sum(axis=1)
+    return rows
+
+
+def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """An image at texture coordinates, repeated; texel centres lie at `(i + 1/2) / n`."""
+    height, width = image.shape
+    with np.errstate(invalid="ignore"):  # a triangle without area has any coordinates
+        column = np.nan_to_num(u - np.floor(u), posinf=0, neginf=0) * width - 0.5
+        row = np.nan_to_num(v - np.floor(v), posinf=0, neginf=0) * height - 0.5
+    left, above = np.floor(column).astype(np.int32), np.floor(row).astype(np.int32)
+    s, t = column - left, row - above
+    left, above = left % width, above % height
+    right, below = (left + 1) % width, (above + 1) % height
+    texels = image.ravel()
+    upper = texels[above * width + left] * (1 - s) + texels[above * width + right] * s
+    lower = texels[below * width + left] * (1 - s) + texels[below * width + right] * s
+    return upper * (1 - t) + lower * t
+
+
+def pixel_rays(camera: Camera, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+    """`x / depth` and `y / depth` of the pixels of some rows, float64 `[rows * w]` each."""
+    x, y = camera.pixel_slopes()
+    y = y[rows]
+    return np.tile(x, len(y)), np.repeat(y, len(x))
+
+
+def by_bands(camera: Camera, work: Callable[[slice], None]) -> None:
+    """Call `work` for bands of rows, on all cores: Embree and large NumPy operations let other threads run."""
+    height, width = camera.viewport.height_px, camera.viewport.width_px
+    n_rows = max(1, 2**16 // width)  # a band's float64 arrays stay in the second-level cache
+    bands = [slice(row, min(row + n_rows, height)) for row in range(0, height, n_rows)]
+    with ThreadPoolExecutor(
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    ) as pool:
+        list(pool.map(work, bands))
