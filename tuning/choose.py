@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -41,12 +42,13 @@ class Choice:
 
 def time_ms(measurement: Measurement, objective: Objective) -> float:
     """The time that is minimised: the slowest frame's median over repeats, or the mean of the frames' medians."""
-    return _over_frames(np.array([_median_ms(repeats) for repeats in measurement.stages_ms["frame"]]), objective)
+    frames_ms = [_median_ms(repeats) for repeats in measurement.stages_ms["frame"] if repeats]
+    return _over_frames(np.array(frames_ms), objective)
 
 
 def time_interval_ms(measurement: Measurement, objective: Objective) -> tuple[float, float]:
     """95 % interval of `time_ms`: that of the slowest frame's median, or the mean of all frames' (cautious)."""
-    frames_ms = measurement.stages_ms["frame"]
+    frames_ms = [repeats for repeats in measurement.stages_ms["frame"] if repeats]
     if objective == "max":
         return median_interval(max(frames_ms, key=_median_ms))
     low, high = np.mean([median_interval(repeats) for repeats in frames_ms], axis=0)
@@ -66,16 +68,20 @@ def median_interval(repeats: Sequence[float]) -> tuple[float, float]:
 
 
 def is_timed(measurement: Measurement) -> bool:
-    """Was it measured, with times that can be compared?"""
+    """Was it measured, with times that can be compared?
+
+    The first frame is enough: a configuration that lost on it was not timed on the others.
+    """
     frames_ms = measurement.stages_ms.get("frame", ())
     return (
         measurement.outcome == "timed"
         and len(frames_ms) > 0
-        and all(repeats and all(map(math.isfinite, repeats)) for repeats in frames_ms)
+        and len(frames_ms[0]) > 0
+        and all(map(math.isfinite, itertools.chain(*frames_ms)))
     )
 
 
-def initial_design(space: Space, counts_of: CountsOf, seed: int = 0, per_technique: int = 5) -> list[Configuration]:
+def initial_design(space: Space, counts_of: CountsOf, seed: int = 0, per_technique: int = 3) -> list[Configuration]:
     """Each technique's default, also where it is not in the space; then, in turns, a few that fill its space.
 
     Those are the configurations next to the points of a Latin hypercube over the ranks of the values. What would

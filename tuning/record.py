@@ -154,8 +154,8 @@ def _check_timed(measurement: Measurement) -> None:
     """What the fit and the report rely on."""
     n_frames = len(measurement.frames)
     frame_ms = measurement.stages_ms.get("frame", ())
-    if not n_frames or len(frame_ms) != n_frames or not all(frame_ms) or len(measurement.counts) != n_frames:
-        raise ValueError("`stages_ms.frame` and `counts` need an entry for each of `frames`")
+    if not n_frames or len(frame_ms) != n_frames or not frame_ms[0] or len(measurement.counts) != n_frames:
+        raise ValueError("`stages_ms.frame` and `counts` need an entry for each of `frames`, and times for the first")
 
 
 def _text(value: Any) -> str:

@@ -25,12 +25,11 @@ def timed_ms(run: Callable[[], object]) -> float:
 def repeats_ms(
     run: Callable[[], object], decided: Callable[[tuple[float, float]], bool], cap_s: float = CAP_S
 ) -> tuple[float, ...]:
-    """Times of at least three runs after one that warms up.
+    """Times of at least three runs. The caller has made one before, which compiled and warmed up.
 
     More are made until the 95 % interval of the median is within 2 %, or `cap_s` is spent, or the interval
     already decides what the caller wants to know (a configuration that has lost needs no third digit).
     """
-    run()
     times: list[float] = []
     while True:
         times.append(timed_ms(run))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 from collections.abc import Callable, Collection
@@ -16,10 +17,10 @@ from tuning.compiles import watch_compiles
 from tuning.measurement import Measurement
 from tuning.space import Space, default_space
 from tuning.sweep import Budget, Progress, SearchResult, search
-from tuning.workload import ScenePath, SceneWorkload, busiest_frames
+from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_counts
 from vtfs.device import versions
 from vtfs.files import write_atomically
-from vtfs.frame import FrameInputs, count
+from vtfs.frame import FrameInputs
 from vtfs.image import exposure, heat_map, tone_map, write_png
 from vtfs.parameters import Configuration, configuration
 from vtfs.scene_setup import SceneSetup
@@ -145,9 +146,13 @@ def choose_frames(setup: SceneSetup) -> tuple[int, ...]:
     configuration, of at most 12 evenly spaced ones."""
     work = {}
     for frame in setup.counted_frames:
-        counts, _ = count(DEFAULT_CONFIGURATION, FrameInputs(setup.samples(frame), setup.lights))
+        counts = cached_counts(DEFAULT_CONFIGURATION, setup.key, frame, functools.partial(_inputs, setup, frame))
         work[frame] = counts.technique["lighting_computations"]
     return busiest_frames(work)
+
+
+def _inputs(setup: SceneSetup, frame: int) -> FrameInputs:
+    return FrameInputs(setup.samples(frame), setup.lights)
 
 
 def _config(measurement: Measurement) -> Configuration:
@@ -188,7 +193,7 @@ def _duel(
 
 
 def _stages(found: SearchResult, objective: Objective) -> dict[str, dict[str, float]]:
-    """Of the fastest exact configuration of each technique, the medians on its slowest frame."""
+    """Of the fastest exact configuration of each technique, the medians on the frame with the most work."""
     stages: dict[str, dict[str, float]] = {}
     fastest: dict[str, Measurement] = {}
     for m in found.measurements:
@@ -196,8 +201,7 @@ def _stages(found: SearchResult, objective: Objective) -> dict[str, dict[str, fl
         if is_timed(m) and exact:
             fastest[m.technique] = min(fastest.get(m.technique, m), m, key=lambda m: time_ms(m, objective))
     for technique, m in fastest.items():
-        slowest = int(np.argmax([np.median(repeats) for repeats in m.stages_ms["frame"]]))
-        stages[technique] = {name: float(np.median(frames[slowest])) for name, frames in m.stages_ms.items()}
+        stages[technique] = {name: float(np.median(frames[0])) for name, frames in m.stages_ms.items()}
     return stages
 
 

@@ -210,26 +210,41 @@ def save_cameras(path: Path | str, camera_path: CameraPath) -> None:
 def default_cameras(scene: Scene, viewport: Viewport, seed: int = 0) -> CameraPath:
     """A 60-frame turn for a scene without cameras.
 
-    The eye is the one of 96 points inside the bounds from which most rays hit between a hundredth of
-    the diagonal (not inside some small object) and half of it. Near is diagonal / 1e4, far is 2 diagonals;
-    y is up. Deterministic for a `seed`.
+    The eye is that point inside the bounds from which most rays hit within half the diagonal, and not at once; back
+    faces count against it (it would stand inside a solid or below the ground), and so do few different triangles (it
+    would stand before a bare wall). Near is diagonal / 1e4, far is 2 diagonals; y is up. Deterministic for a `seed`.
     """
-    from vtfs.view_samples import Tracer  # Embree: only where it is used
+    from vtfs.tracer import Tracer  # Embree: only where it is used
 
-    tracer = Tracer(scene)
-    low, high = scene.bounds_m
-    candidates = low + (high - low) * np.random.default_rng(seed).uniform(0.1, 0.9, (96, 3))
-    directions = _sphere_directions(512)
-    origins = np.repeat(candidates, len(directions), axis=0)
-    share_m = tracer.hit_distances_m(origins, np.tile(directions, (len(candidates), 1)))
-    relative = share_m.reshape(len(candidates), -1) / scene.diagonal_m
-    eye = candidates[np.argmax(((relative > 0.01) & (relative < 0.5)).mean(axis=1))]
+    candidates = _standpoints(scene, np.random.default_rng(seed))
+    directions = _sphere_directions(256)
+    origins, along = np.repeat(candidates, len(directions), axis=0), np.tile(directions, (len(candidates), 1))
+    triangle, distance_m = Tracer(scene).first_hits(origins, along)
+    relative = np.where(triangle >= 0, distance_m, np.inf) / scene.diagonal_m
+    corners = scene.vertices_m[scene.triangles[np.maximum(triangle, 0)]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    two_sided = np.array([material.two_sided for material in scene.materials])[scene.material_index[triangle]]
+    is_back = (triangle >= 0) & ((normal * along).sum(axis=1) > 0) & ~two_sided
+    shape = (len(candidates), len(directions))
+    is_near = ((relative > 0.01) & (relative < 0.5) & ~is_back).reshape(shape)
+    n_different = np.array([len(np.unique(seen)) for seen in triangle.reshape(shape)])
+    score = is_near.mean(axis=1) * (1 - is_back.reshape(shape).mean(axis=1)) ** 4 * np.sqrt(n_different)
+    eye = candidates[np.argmax(score)]
     poses = []
     for angle in 2 * np.pi * np.arange(60) / 60:
         # A little downward: floors and streets show, the sky does not fill half the image.
         target = eye + 0.25 * scene.diagonal_m * np.array([np.sin(angle), -0.15, -np.cos(angle)])
         poses.append(Pose(_vector(eye), _vector(target), (0.0, 1.0, 0.0)))
     return CameraPath(viewport, 60.0, scene.diagonal_m / 1e4, 2 * scene.diagonal_m, tuple(poses))
+
+
+def _standpoints(scene: Scene, rng: np.random.Generator) -> np.ndarray:
+    """Points inside the bounds, `[N, 3]`: spread evenly, and above triangles (some scenes fill little of their box)."""
+    low, high = scene.bounds_m
+    spread = low + (high - low) * rng.uniform(0.1, 0.9, (64, 3))
+    centres = scene.vertices_m[scene.triangles[rng.integers(scene.n_triangles, size=192)]].mean(axis=1)
+    centres[:, 1] += scene.diagonal_m * rng.uniform(0.002, 0.05, 192)
+    return np.concatenate([spread, centres[((centres > low) & (centres < high)).all(axis=1)]])
 
 
 def _sphere_directions(n: int) -> np.ndarray:
@@ -253,7 +268,8 @@ def _read_json(path: Path) -> dict[str, Any]:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, or nested without end
-        raise InputError(f"{path}: not JSON ({_short(str(error), 80)}); write it as design `cameras.json`.") from None
+        reason = _short(str(error), 80)
+        raise InputError(f"{path}: not JSON ({reason}); save it with the keys `width` to `frames`.") from None
     if not isinstance(record, dict):
         raise InputError(f"{path}: must hold an object with `width`, `height`, ..., `frames`, not {_short(record)}.")
     return record

@@ -207,6 +207,25 @@ class FrameCounts:
         capacity = self.sizes.blocks or len(self.of_block)
         return self.technique | batch_counts(self.of_block, self.walk_rows, batch, capacity, chunk)
 
+    def as_arrays(self) -> dict[str, np.ndarray]:
+        """For a cache; the inverse of `from_arrays`."""
+        sizes = (self.sizes.cells, self.sizes.blocks, self.sizes.pairs)
+        return {
+            "names": np.array(list(self.technique)),
+            "counts": np.array(list(self.technique.values()), np.int64),
+            "of_block": self.of_block,
+            "walk_rows": np.array(self.walk_rows, np.int64),
+            "branching": np.array(self.branching),
+            "sizes": np.array(sizes, np.int64),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> FrameCounts:
+        technique = {str(name): int(value) for name, value in zip(arrays["names"], arrays["counts"], strict=True)}
+        walk_rows = tuple(int(rows) for rows in arrays["walk_rows"])
+        sizes = Sizes(*(int(size) for size in arrays["sizes"]))
+        return cls(technique, arrays["of_block"], walk_rows, int(arrays["branching"]), sizes)
+
 
 def count(
     config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None

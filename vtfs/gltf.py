@@ -24,8 +24,11 @@ from vtfs.input_error import InputError
 from vtfs.scene import Scene
 
 log = logging.getLogger("vtfs.gltf")
+# Python prints what no handler takes, tracebacks too; what matters of it is in our errors.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 _LARGEST_TRIANGLES = 50_000_000  # instances written out: a small file can name one mesh many times
+_LARGEST_PARTS = 1_000_000
 _TRIANGLES, _STRIP = 4, 5
 _UNDERSTOOD = {
     "KHR_lights_punctual", "KHR_materials_emissive_strength", "KHR_texture_transform", "KHR_materials_specular",
@@ -54,17 +57,23 @@ def load_gltf(path: Path) -> Scene:
     for name in document.json.get("extensionsRequired", []):
         if name not in _UNDERSTOOD:
             raise InputError(f"extensionsRequired: `{str(name)[:60]}` is not supported; export without it.")
-    primitives = _primitives(document)
+    meshes = _primitives(document)
     nodes = placed_nodes(document)
-    instances = [(p, world) for node, world in nodes for p in _primitives_of(document, node, primitives)]
-    flat = [part for parts in primitives for part in parts]
-    n_triangles = sum(flat[p].n_triangles for p, _ in instances)
+    placed = [(_mesh_of(document, node), world) for node, world in nodes if "mesh" in node]
+    # Counted before it is written out: a few kilobytes can name 10**12 triangles.
+    n_parts = sum(len(meshes[mesh]) for mesh, _ in placed)
+    per_mesh = [sum(part.n_triangles for part in parts) for parts in meshes]
+    n_triangles = sum(per_mesh[mesh] for mesh, _ in placed)
+    if n_triangles > _LARGEST_TRIANGLES or n_parts > _LARGEST_PARTS:
+        raise InputError(
+            f"{n_triangles} triangles in {n_parts} parts with all instances: at most {_LARGEST_TRIANGLES} in "
+            f"{_LARGEST_PARTS} are read; split it."
+        )
     if n_triangles == 0:
         raise InputError("the scene has no triangles; export a mesh with faces.")
-    if n_triangles > _LARGEST_TRIANGLES:
-        raise InputError(
-            f"{n_triangles} triangles with all instances: at most {_LARGEST_TRIANGLES} are read; split it."
-        )
+    first = np.cumsum([0, *(len(parts) for parts in meshes)]).tolist()  # numbers of primitives run over all meshes
+    flat = [part for parts in meshes for part in parts]
+    instances = [(p, world) for mesh, world in placed for p in range(first[mesh], first[mesh + 1])]
     scene = _assemble(path.stem, document, flat, instances)
     cameras = cameras_of(document, nodes)
     return replace(scene, cameras=cameras, lights=lights_of(document, nodes, scene.diagonal_m))
@@ -135,13 +144,9 @@ def _same_count(document: Document, index: int, position: int, field: str) -> No
         )
 
 
-def _primitives_of(document: Document, node: Json, primitives: list[list[Primitive]]) -> range:
-    """Numbers of the primitives of a node's mesh, counted over all meshes."""
-    if "mesh" not in node:
-        return range(0)
+def _mesh_of(document: Document, node: Json) -> int:
     document.entry("meshes", node["mesh"], "a node's mesh")
-    start = sum(len(parts) for parts in primitives[: node["mesh"]])
-    return range(start, start + len(primitives[node["mesh"]]))
+    return node["mesh"]
 
 
 def _assemble(name: str, document: Document, parts: list[Primitive], instances: list[tuple[int, np.ndarray]]) -> Scene:

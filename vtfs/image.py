@@ -47,5 +47,5 @@ def write_png(path: Path | str, pixels: np.ndarray) -> None:
     from PIL import Image
 
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG", optimize=True)
+    Image.fromarray(pixels).save(buffer, "PNG")
     write_atomically(path, buffer.getvalue())

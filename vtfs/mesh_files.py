@@ -20,6 +20,8 @@ from vtfs.scene import Material, Scene
 from vtfs.scene_folder import alpha_of, decode_image, linear_from_srgb, mean_linear_colour, path_inside, read_inside
 
 log = logging.getLogger("vtfs.mesh_files")
+# Python prints what no handler takes, tracebacks too; what matters of it is in our errors.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 _PLY_BYTES = {
     "char": 1, "int8": 1, "uchar": 1, "uint8": 1, "short": 2, "int16": 2, "ushort": 2, "uint16": 2, "int": 4,

@@ -113,14 +113,16 @@ def assign_counts(counts: AssignCounts, n_lights: int, branching: int) -> OpCoun
     below = (*levels[1:], n_leaves)[: len(levels)]
     return {
         "tree_tests": n_child_tests(counts.node_rows, counts.short_rows, below, branching),
-        "leaf_tests": n_child_tests(counts.leaf_rows[None], counts.short_leaf_rows[None], (n_lights,), branching),
+        "leaf_tests": n_child_tests(
+            np.asarray(counts.leaf_rows)[None], np.asarray(counts.short_leaf_rows)[None], (n_lights,), branching
+        ),
         "tree_nodes": sum(levels) + n_leaves,
     }
 
 
 def walk_rows(counts: AssignCounts) -> tuple[int, ...]:
     """(cluster, node) pairs on each level, the leaves' last."""
-    return (*map(int, counts.node_rows), int(counts.leaf_rows))
+    return (*map(int, np.asarray(counts.node_rows)), int(counts.leaf_rows))
 
 
 def memory_counts(gbuffer: GBuffer, structures: object, n_samples: int, n_pairs: int) -> OpCounts:

@@ -45,26 +45,30 @@ def _shade(samples: ViewSamples, box: tuple[slice, slice], valid: np.ndarray, vi
     outside = np.maximum(position.min(0) - view.position_m, view.position_m - position.max(0)).clip(0)
     reach = np.flatnonzero((outside**2).sum(1) <= view.range_m**2 * (1 + 1e-12))
     reach = reach[view.range_m[reach] > 0]
-    # Lights first: [lights, samples].
-    to = [view.position_m[reach, c, None] - position[None, :, c] for c in range(3)]
-    distance2 = sum(t * t for t in to)
-    distance = np.sqrt(distance2)
-    window = np.maximum(0, 1 - (distance2 / view.range_m[reach, None] ** 2) ** 2) ** 2
-    with np.errstate(invalid="ignore", divide="ignore"):
-        to_unit = [np.nan_to_num(t / distance) for t in to]
-        eye = -position / np.linalg.norm(position, axis=1, keepdims=True)
-        half = [t + eye[None, :, c] for c, t in enumerate(to_unit)]
-        length = np.sqrt(sum(h * h for h in half))
-        n_dot_h = np.nan_to_num(sum(h * normal[None, :, c] for c, h in enumerate(half)) / length).clip(0)
-    n_dot_l = sum(t * normal[None, :, c] for c, t in enumerate(to_unit)).clip(0)
-    along = -sum(t * view.direction[reach, c, None] for c, t in enumerate(to_unit))
-    cos_outer, cos_inner = view.cos_outer[reach, None], view.cos_inner[reach, None]
-    cone = ((along - cos_outer) / (cos_inner - cos_outer)).clip(0, 1)
-    lit = cone * window / np.maximum(distance2, _MIN_DISTANCE2_M2) * n_dot_l
-    gloss = specular * n_dot_h**shininess
+    # Pairs in reach only: beyond its range a light's window is exactly 0.
+    to_all = [view.position_m[reach, c, None] - position[None, :, c] for c in range(3)]
+    light, sample = np.nonzero(sum(t * t for t in to_all) < view.range_m[reach, None] ** 2)
+    to = np.stack([t[light, sample] for t in to_all])
+    light = reach[light]
+    # A light behind the surface adds nothing; half of them are.
+    facing = np.einsum("cp,pc->p", to, normal[sample]) > 0
+    to, light, sample = to[:, facing], light[facing], sample[facing]
+    distance2 = np.einsum("cp,cp->p", to, to)
+    to_unit = to / np.sqrt(distance2)
+    window = (1 - (distance2 / view.range_m[light] ** 2) ** 2) ** 2
+    n = normal[sample].T
+    half = to_unit - (position / np.linalg.norm(position, axis=1, keepdims=True))[sample].T
+    length = np.sqrt(np.einsum("cp,cp->p", half, half))
+    # Light straight from behind the sample has no half vector, and no highlight.
+    n_dot_h = np.maximum(np.einsum("cp,cp->p", n, half) / np.where(length > 0, length, 1), 0)
+    along = -np.einsum("cp,pc->p", to_unit, view.direction[light])
+    cone = ((along - view.cos_outer[light]) / (view.cos_inner - view.cos_outer)[light]).clip(0, 1)
+    lit = cone * window / np.maximum(distance2, _MIN_DISTANCE2_M2) * np.einsum("cp,cp->p", n, to_unit)
+    gloss = specular[sample] * n_dot_h ** shininess[sample]
     return np.stack(
         [
-            emissive[:, c] + (lit * view.colour[reach, c, None] * (base[None, :, c] + gloss)).sum(0)
+            emissive[:, c]
+            + np.bincount(sample, lit * view.colour[light, c] * (base[sample, c] + gloss), minlength=len(position))
             for c in range(3)
         ],
         axis=1,

@@ -37,8 +37,8 @@ def path_inside(folder: Path, name: str, field: str) -> Path:
         if not path.resolve().is_relative_to(folder.resolve()):
             raise InputError(out)
         path.is_file()
-    except (OSError, RuntimeError) as error:  # a name that is too long, a loop of links
-        raise InputError(f"{field} = {name[:80]!r}: is no file name that can be read ({error}); rename it.") from None
+    except (OSError, RuntimeError):  # a name that is too long, a loop of links
+        raise InputError(f"{field} = {name[:80]!r}: is no file name that can be read; rename it.") from None
     return path
 
 
@@ -52,7 +52,7 @@ def read_inside(folder: Path, name: str, field: str) -> bytes:
             raise InputError(f"{field} = {name[:80]!r}: is larger than {_LARGEST_FILE_BYTES} bytes; split the scene.")
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"{field} = {name[:80]!r}: cannot be read ({error}); check the file.") from None
+        raise InputError(f"{field} = {name[:80]!r}: cannot be read ({error.strerror}); check the file.") from None
 
 
 def decode_image(content: bytes, field: str) -> Image:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from vtfs.cache import cached
 from vtfs.camera import CameraPath, Viewport, default_cameras, load_cameras
 from vtfs.gallery import GALLERY, build_scene
 from vtfs.input_error import InputError
@@ -87,16 +88,18 @@ class SceneSetup:
         """Given, or scattered so that a visible sample is reached by so many in the median."""
         if isinstance(self._lights, Lights):
             return self._lights
-        visible = [self._some_positions(frame) for frame in self.counted_frames]
-        options = self._options
-        return scatter_lights(
-            self._source.bounds_m(self.cameras),
-            self._lights,
-            self.seed,
-            np.concatenate(visible),
-            options.lights_per_sample,
-            options.density,
-        )
+        n_lights, options = self._lights, self._options
+
+        def scatter() -> dict[str, np.ndarray]:
+            visible = [self._some_positions(frame) for frame in self.counted_frames]
+            bounds_m = self._source.bounds_m(self.cameras)
+            scattered = scatter_lights(
+                bounds_m, n_lights, self.seed, np.concatenate(visible), options.lights_per_sample, options.density
+            )
+            return {field.name: getattr(scattered, field.name) for field in fields(scattered)}
+
+        asked = (n_lights, self.seed, options.lights_per_sample, options.density)
+        return Lights(**cached("lights", (self._source.key, self.cameras.key, repr(asked)), scatter))
 
     @property
     def key(self) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from vtfs.cluster_grid import ClusterGrid
@@ -27,9 +28,9 @@ from vtfs.morton import morton_codes
 from vtfs.parameters import Configuration
 from vtfs.shading import Image, shade
 
-_MAX_TESTS_AT_ONCE = 2**22
-"""`batch = 0` means all queries at once, but a walk whose rows of boxes fill the memory helps nobody: at
-32 children a node this is 131,072 nodes and 100 MB."""
+_TESTS_AT_ONCE = {"cpu": 2**19, "gpu": 2**22}
+"""`batch = 0` means all queries at once, as far as their rows of boxes stay in the cache of a CPU (12 MB) or leave
+the memory of a GPU to others (100 MB)."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def _clusters(plan: Plan, positions: Positions, grid: ClusterGrid) -> Clusters:
 
 def walk_chunk(batch: int, branching: int, pairs: int) -> int:
     """(cluster, node) pairs tested at once."""
-    return batch or min(pairs, _MAX_TESTS_AT_ONCE // branching)
+    return batch or min(pairs, _TESTS_AT_ONCE.get(jax.default_backend(), 2**22) // branching)
 
 
 def _assign_brute_force(plan: Plan, lights: ViewLights, light_cutoff, clusters: Clusters) -> LightLists:

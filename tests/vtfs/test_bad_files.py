@@ -12,6 +12,8 @@ from vtfs.gallery import build_scene
 from vtfs.input_error import InputError
 from vtfs.scene import Scene, load_scene, save_scene
 
+HEAD = "ply\nformat ascii 1.0\n"
+
 
 def refused(path, message):
     with pytest.raises(InputError, match=message) as caught:
@@ -95,7 +97,11 @@ def changed(path, value):
         (("materials", 0, "pbrMetallicRoughness"), {"baseColorFactor": [1, 1, -1, 1]}, "material `only` `base_colour`"),
         (("materials", 0, "pbrMetallicRoughness"), {"baseColorTexture": {"index": 0}}, "one of 0 textures"),
         (("extensionsRequired",), ["KHR_draco_mesh_compression"], "`KHR_draco_mesh_compression` is not supported"),
-        (("buffers", 0, "uri"), "../outside.bin", r"buffers\[0\].uri = '../outside.bin': leads out of the scene's folder"),
+        (
+            ("buffers", 0, "uri"),
+            "../outside.bin",
+            r"buffers\[0\].uri = '../outside.bin': leads out of the scene's folder",
+        ),
         (("buffers", 0, "uri"), "/etc/passwd", "leads out"),
         (("buffers", 0, "uri"), "http://example.org/a.bin", "leads out"),
         (("buffers", 0, "uri"), "file:///etc/passwd", "leads out"),
@@ -132,7 +138,7 @@ def test_a_small_file_cannot_name_more_triangles_than_fit(tmp_path):
     tree["scenes"] = [{"nodes": list(range(8_000))}]
     tree["meshes"][0]["primitives"] *= 8_000
     (tmp_path / "t.glb").write_bytes(glb(tree, body))
-    refused(tmp_path / "t.glb", "64000000 triangles with all instances")
+    refused(tmp_path / "t.glb", "64000000 triangles in 64000000 parts")
 
 
 def test_images_are_measured_before_they_are_decoded(tmp_path):
@@ -140,7 +146,11 @@ def test_images_are_measured_before_they_are_decoded(tmp_path):
     bomb[16:24] = struct.pack(">II", 60_000, 60_000)
     (tmp_path / "bomb.png").write_bytes(bomb)
     (tmp_path / "text.png").write_text("no image")
-    for name, message in (("bomb.png", r"images\[0\]: "), ("text.png", r"images\[0\]: is not a PNG"), ("../x.png", "leads out")):
+    for name, message in (
+        ("bomb.png", r"images\[0\]: "),
+        ("text.png", r"images\[0\]: is not a PNG"),
+        ("../x.png", "leads out"),
+    ):
         tree, body = triangle(textures=[{"source": 0}], images=[{"uri": name}])
         tree["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
         (tmp_path / "t.glb").write_bytes(glb(tree, body))
@@ -162,10 +172,10 @@ def test_images_are_measured_before_they_are_decoded(tmp_path):
         ("ply", "no", "must be b'ply'"),
         ("ply", "ply\nformat ascii 1.0\n", "has no `end_header`"),
         ("ply", "ply\nformat odd 1.0\nend_header\n", "`format` = 'odd'"),
-        ("ply", "ply\nformat ascii 1.0\nelement vertex 999999999\nproperty float x\nend_header\n0\n", "element vertex 999999999"),
-        ("ply", "ply\nformat ascii 1.0\nelement vertex many\nend_header\n", "must be `element NAME COUNT`"),
-        ("ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty quad x\nend_header\n0\n", "property quad x"),
-        ("ply", "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "no triangles|trimesh cannot"),
+        ("ply", HEAD + "element vertex 999999999\nproperty float x\nend_header\n0\n", "element vertex 999999999"),
+        ("ply", HEAD + "element vertex many\nend_header\n", "must be `element NAME COUNT`"),
+        ("ply", HEAD + "element vertex 1\nproperty quad x\nend_header\n0\n", "property quad x"),
+        ("ply", HEAD + "element vertex 0\nproperty float x\nend_header\n", "no triangles|trimesh cannot"),
         ("stl", "solid s\nfacet\nvertex 0 0 0\n", "`endsolid` is missing"),
         ("stl", "solid s\nendsolid s\n", "header count|no triangles"),
         ("stl", "x" * 80 + "\xff\xff\xff\x7f" + "y" * 50, "header count = 2147483647 triangles needs"),
@@ -231,7 +241,7 @@ def test_damaged_files_are_read_or_refused(tmp_path, suffix, seed):
             if rng.random() < 0.5:
                 bad[at] ^= 1 << rng.integers(8)
             else:
-                bad[at] = rng.choice(np.frombuffer(b"0129-.e/{}[],\": \n\xff\0", np.uint8))
+                bad[at] = rng.choice(np.frombuffer(b'0129-.e/{}[],": \n\xff\0', np.uint8))
         path.write_bytes(bad[: rng.integers(len(bad))] if rng.random() < 0.3 else bad)
         outcome(path)
 
@@ -239,8 +249,7 @@ def test_damaged_files_are_read_or_refused(tmp_path, suffix, seed):
 def damaged_source(tmp_path, suffix):
     tree, body = triangle()
     if suffix == ".glb":
-        save_scene(build_scene("grove", 1_000), tmp_path / "grove.glb")
-        return (tmp_path / "grove.glb").read_bytes() if np.random.default_rng().random() < 0 else glb(tree, body)
+        return glb(tree, body)
     if suffix == ".gltf":
         tree["buffers"][0]["uri"] = "t.bin"
         (tmp_path / "t.bin").write_bytes(body)

@@ -2,6 +2,8 @@
 
 import json
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from vtfs.camera import Camera, CameraPath, Pose, Viewport, default_cameras, loa
 from vtfs.gallery import build_scene
 from vtfs.input_error import InputError
 
-GOOD = {
+GOOD: dict[str, Any] = {
     "eye_m": (1.0, 2.0, 3.0),
     "target_m": (0.0, 1.0, -4.0),
     "up": (0.0, 1.0, 0.0),
@@ -76,9 +78,9 @@ def test_a_degenerate_camera_is_refused_by_name(change, message):
 
 
 def test_far_may_be_infinite_and_the_key_tells_views_apart():
-    assert Camera(**(GOOD | {"far_m": math.inf})).far_m == math.inf
+    assert replace(Camera(**GOOD), far_m=math.inf).far_m == math.inf
     assert Camera(**GOOD).key == Camera(**GOOD).key
-    assert len({Camera(**GOOD).key, Camera(**(GOOD | {"near_m": 0.2})).key}) == 2
+    assert len({Camera(**GOOD).key, replace(Camera(**GOOD), near_m=0.2).key}) == 2
 
 
 @pytest.mark.parametrize("far_m", [250.0, math.inf])

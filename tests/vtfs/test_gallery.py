@@ -50,7 +50,10 @@ def test_the_camera_never_comes_near_a_surface(name, seed):
     assert step_m.max() < 5  # a path, closed, without jumps
 
 
-@pytest.mark.parametrize(("name", "n", "message"), [("castle", None, "`castle`: unknown"), ("grove", 999, "= 999"), ("grove", 1_000_001, "= 1000001")])
+@pytest.mark.parametrize(
+    ("name", "n", "message"),
+    [("castle", None, "`castle`: unknown"), ("grove", 999, "= 999"), ("grove", 1_000_001, "= 1000001")],
+)
 def test_what_is_not_there_is_refused(name, n, message):
     with pytest.raises(InputError, match=message):
         build_scene(name, n)

@@ -23,6 +23,11 @@ def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("VTFS_CACHE_DIR", str(tmp_path / "cache"))
 
 
+def frame(scene: Scene, width_px: int, height_px: int, i: int) -> Camera:
+    assert scene.cameras is not None
+    return scene.cameras.resized(Viewport(width_px, height_px)).camera(i)
+
+
 def brute_force_hits(scene, camera):
     """Depth and triangle of the nearest surface of each pixel by Moeller-Trumbore, alpha tests by a plain loop."""
     v0, v1, v2 = (scene.vertices_m[scene.triangles[:, k]] for k in range(3))
@@ -59,14 +64,16 @@ def oracle_texel(image, u, v):
     x, y = u * width - 0.5, v * height - 0.5
     i, j = math.floor(x), math.floor(y)
     return sum(
-        image[(j + b) % height, (i + a) % width] * abs(1 - a - (x - i)) * abs(1 - b - (y - j)) for a in (0, 1) for b in (0, 1)
+        image[(j + b) % height, (i + a) % width] * abs(1 - a - (x - i)) * abs(1 - b - (y - j))
+        for a in (0, 1)
+        for b in (0, 1)
     )
 
 
 @pytest.mark.parametrize("name", ["atrium", "street", "grove"])
 def test_samples_are_where_rays_meet_all_triangles_in_float64(name):
     scene = build_scene(name, 1_500)
-    camera = scene.cameras.resized(Viewport(40, 22)).camera(7)
+    camera = frame(scene, 40, 22, 7)
     samples = trace_view_samples(scene, camera)
     depth, seen = brute_force_hits(scene, camera)
     same = samples.triangle == seen
@@ -79,7 +86,9 @@ def test_samples_are_where_rays_meet_all_triangles_in_float64(name):
     x, y = camera.pixel_slopes()
     lies = samples.valid
     assert_allclose(samples.position_m[..., 0][lies], (x * -samples.position_m[..., 2])[lies], rtol=1e-6, atol=1e-7)
-    assert_allclose(samples.position_m[..., 1][lies], (y[:, None] * -samples.position_m[..., 2])[lies], rtol=1e-6, atol=1e-7)
+    assert_allclose(
+        samples.position_m[..., 1][lies], (y[:, None] * -samples.position_m[..., 2])[lies], rtol=1e-6, atol=1e-7
+    )
     assert_allclose(np.linalg.norm(samples.normal[lies], axis=-1), 1, rtol=1e-6)
     assert ((samples.normal * samples.position_m).sum(-1)[lies] <= 1e-6).all()  # facing the eye
     colour = np.array([scene.materials[m].base_colour for m in scene.material_index[samples.triangle[lies]]])
@@ -109,7 +118,11 @@ def stacked(*squares):
 
 FRONT = Camera((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 60.0, 0.1, 50.0, Viewport(16, 16))
 SOLID = Material("solid", (0.1, 0.2, 0.3))
-HALF = Material("half", alpha_mode="mask", alpha_image=np.repeat([[0.0], [1.0]], [8, 8], axis=0).astype(np.float32) * np.ones(16, np.float32))
+HALF = Material(
+    "half",
+    alpha_mode="mask",
+    alpha_image=np.repeat([[0.0], [1.0]], [8, 8], axis=0).astype(np.float32) * np.ones(16, np.float32),
+)
 BLEND = Material("blend", opacity=0.5, alpha_mode="blend")
 
 
@@ -172,16 +185,18 @@ def test_bilinear_is_the_plain_sum_of_four_texels():
 
 def test_the_cache_gives_the_same_samples_and_no_second_tracing(monkeypatch):
     scene = build_scene("grove", 1_500)
-    camera = scene.cameras.resized(Viewport(64, 36)).camera(0)
+    camera = frame(scene, 64, 36, 0)
     first = trace_view_samples(scene, camera)
     monkeypatch.setattr(Tracer, "__init__", lambda *_: pytest.fail("traced again"))
     assert trace_view_samples(scene, camera).key == first.key
 
 
-@pytest.mark.parametrize("damage", [lambda b: b[:100], lambda b: b[:200] + b"\x01" + b[201:], lambda b: b"", lambda b: b * 2])
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[:100], lambda b: b[:200] + b"\x01" + b[201:], lambda b: b"", lambda b: b * 2]
+)
 def test_a_damaged_cache_is_replaced(tmp_path, damage):
     scene = build_scene("atrium", 1_500)
-    camera = scene.cameras.resized(Viewport(64, 36)).camera(0)
+    camera = frame(scene, 64, 36, 0)
     first = trace_view_samples(scene, camera)
     (file,) = (tmp_path / "cache" / "view_samples").iterdir()
     good = file.read_bytes()
@@ -198,7 +213,7 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
 
 def test_a_gbuffer_survives_its_file(tmp_path):
     scene = build_scene("street", 1_500)
-    samples = trace_view_samples(scene, scene.cameras.resized(Viewport(64, 36)).camera(0))
+    samples = trace_view_samples(scene, frame(scene, 64, 36, 0))
     save_gbuffer(tmp_path / "g.npz", samples)
     again = load_gbuffer(tmp_path / "g.npz", samples.camera)
     assert_array_equal(again.valid, samples.valid)
@@ -211,7 +226,7 @@ def gbuffer(**changes):
     shape = (16, 16)
     arrays = {
         "depth": np.full(shape, 5.0, np.float32),
-        "normal": np.tile(np.float32([0, 0, 1]), (*shape, 1)),
+        "normal": np.tile(np.array([0, 0, 1], np.float32), (*shape, 1)),
         "base_colour": np.full((*shape, 3), 0.5, np.float32),
     }
     return {key: value for key, value in (arrays | changes).items() if value is not None}
@@ -227,7 +242,9 @@ def test_depth_and_a_layer_axis_are_enough(tmp_path):
 
 def shifted():
     x, y = FRONT.pixel_slopes()
-    position = np.stack([np.broadcast_to(x * 5, (16, 16)), np.broadcast_to(y[:, None] * 5, (16, 16)), np.full((16, 16), -5.0)], -1)
+    position = np.stack(
+        [np.broadcast_to(x * 5, (16, 16)), np.broadcast_to(y[:, None] * 5, (16, 16)), np.full((16, 16), -5.0)], -1
+    )
     position[3, 4, 0] += 5 * (x[1] - x[0])
     return position
 

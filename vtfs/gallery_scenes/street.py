@@ -98,12 +98,13 @@ def _house(
     n_up = max(1, round(n_storeys / widen**0.5))
     cell_x, cell_y, height, depth = width / n_across, n_storeys * _CELL_Y / n_up, n_storeys * _CELL_Y, 9.0
     half, door = width / 2, n_across // 2
+    inner = half - 0.02  # neighbours' side walls must not lie in one plane
     cells = [(i, j) for i in range(n_across) for j in range(n_up) if is_plain or (i, j) != (door, 0)]
     feet = np.array([((i + 0.5) * cell_x - half, j * cell_y, 0.0) for i, j in cells])
     wall, frame, glass = _window_cell(n, cell_x, cell_y)
     shell = [
-        flat((half, 0, 0), (0, 0, -depth), (0, height, 0), n(4), n(6)),
-        flat((-half, 0, -depth), (0, 0, depth), (0, height, 0), n(4), n(6)),
+        flat((inner, 0, 0), (0, 0, -depth), (0, height, 0), n(4), n(6)),
+        flat((-inner, 0, -depth), (0, 0, depth), (0, height, 0), n(4), n(6)),
         copies(wall, feet),
     ]
     ridge = 2.2

@@ -1,0 +1,197 @@
+"""What is right, the slow and obvious way: NumPy and Python loops in float64, apart from all code under test."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from vtfs.camera import Camera, Viewport
+from vtfs.lights import Lights
+from vtfs.view_samples import ViewSamples
+
+
+def in_view_space(camera: Camera, position_m: np.ndarray) -> np.ndarray:
+    """World to view space, `[N, 3]`."""
+    matrix = camera.view_from_world
+    return np.asarray(position_m, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def in_world_space(camera: Camera, position_m: np.ndarray) -> np.ndarray:
+    """View to world space, `[N, 3]`."""
+    matrix = camera.view_from_world
+    return (np.asarray(position_m, np.float64) - matrix[:3, 3]) @ matrix[:3, :3]
+
+
+def windows(samples: ViewSamples, lights: Lights) -> np.ndarray:
+    """`max(0, 1 - (d/range)^4)^2` of each light at each pixel, `[h, w, N]`; 0 where the sample is invalid."""
+    position_m = samples.position_m.astype(np.float64)
+    window = np.zeros((*samples.valid.shape, lights.n_lights))
+    for n, light_m in enumerate(in_view_space(samples.camera, lights.position_m)):
+        if lights.range_m[n] > 0:
+            ratio = np.linalg.norm(position_m - light_m, axis=-1) / lights.range_m[n]
+            window[..., n] = np.where(samples.valid, np.maximum(0, 1 - ratio**4) ** 2, 0)
+    return window
+
+
+def image(samples: ViewSamples, lights: Lights, light_cutoff: float = 0.0) -> np.ndarray:
+    """Blinn-Phong of all lights on all samples, one light after the other: float64 `[h, w, 3]`."""
+    position_m, normal, base, emissive = (
+        channel.astype(np.float64)
+        for channel in (samples.position_m, samples.normal, samples.base_colour, samples.emissive)
+    )
+    specular, shininess = samples.specular.astype(np.float64), samples.shininess.astype(np.float64)
+    window = windows(samples, lights)
+    total = emissive.copy()
+    rotation = samples.camera.view_from_world[:3, :3]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        to_eye = -position_m / np.linalg.norm(position_m, axis=-1, keepdims=True)
+        for n, light_m in enumerate(in_view_space(samples.camera, lights.position_m)):
+            to_light = light_m - position_m
+            distance = np.linalg.norm(to_light, axis=-1)
+            to_light /= distance[..., None]
+            half = to_light + to_eye
+            half /= np.linalg.norm(half, axis=-1, keepdims=True)
+            n_dot_l = np.maximum(0, (normal * to_light).sum(-1))
+            n_dot_h = np.maximum(0, (normal * half).sum(-1))
+            cone = 1.0
+            if lights.cos_outer[n] >= -1:
+                cos = -(to_light * (rotation @ lights.direction[n])).sum(-1)
+                width = lights.cos_inner[n] - lights.cos_outer[n]
+                cone = np.clip((cos - lights.cos_outer[n]) / width, 0, 1)
+            falloff = np.where(window[..., n] > light_cutoff, window[..., n], 0) / np.maximum(distance**2, 1e-4)
+            gloss = specular * n_dot_h**shininess
+            added = (cone * falloff * n_dot_l)[..., None] * lights.colour[n] * (base + gloss[..., None])
+            total += np.where((falloff > 0)[..., None], added, 0)
+    return np.where(samples.valid[..., None], total, 0)
+
+
+def near_cutoff(samples: ViewSamples, lights: Lights, light_cutoff: float, slack: float) -> np.ndarray:
+    """Pixels where a window is so near to the cut-off that rounding decides, bool `[h, w]`."""
+    if not light_cutoff:
+        return np.zeros(samples.valid.shape, bool)
+    return (np.abs(windows(samples, lights) - light_cutoff) < slack).any(axis=-1)
+
+
+def run_pixels(viewport: Viewport) -> np.ndarray:
+    """Row and column of each lane of each run, `[runs, 32, 2]`: runs of 8 x 4 pixels, row by row."""
+    pixels = []
+    for top in range(0, viewport.height_px, 4):
+        for left in range(0, viewport.width_px, 8):
+            pixels.append([(top + lane // 8, left + lane % 8) for lane in range(32)])
+    return np.array(pixels)
+
+
+def as_image(runs: np.ndarray, viewport: Viewport) -> np.ndarray:
+    """`[runs, 32]` to `[h, w]`, pixel by pixel."""
+    picture = np.zeros((viewport.height_px, viewport.width_px), np.asarray(runs).dtype)
+    rows, columns = np.moveaxis(run_pixels(viewport), -1, 0)
+    inside = (rows < viewport.height_px) & (columns < viewport.width_px)
+    picture[rows[inside], columns[inside]] = np.asarray(runs)[inside]
+    return picture
+
+
+def n_slices(camera: Camera, tile_px: int, depth_slices: int, far_m: float) -> tuple[float, int]:
+    """Growth factor and number of slices (equations 8.1, 8.2 with a ceiling)."""
+    if depth_slices:
+        return (far_m / camera.near_m) ** (1 / depth_slices), depth_slices
+    rows = math.ceil(camera.viewport.height_px / tile_px)
+    growth = 1 + 2 * math.tan(math.radians(camera.fov_y_deg / 2)) / rows
+    return growth, math.ceil(math.log(far_m / camera.near_m) / math.log(growth))
+
+
+def cells(samples: ViewSamples, tile_px: int, slices: np.ndarray) -> dict[tuple[int, int, int], list[tuple[int, int]]]:
+    """The valid pixels of each occupied cell (slice, tile row, tile column); `slices` is `[h, w]`."""
+    found: dict[tuple[int, int, int], list[tuple[int, int]]] = {}
+    for y, x in np.argwhere(samples.valid):
+        found.setdefault((int(slices[y, x]), y // tile_px, x // tile_px), []).append((y, x))
+    return found
+
+
+def spheres_in_boxes(centre_m: np.ndarray, radius_m: np.ndarray, low: np.ndarray, high: np.ndarray, share: float = 1):
+    """Do spheres, with `share` of their radius, touch boxes? bool `[boxes, spheres]` from `[N, 3]` and `[B, 3]`."""
+    outside = np.maximum(np.maximum(low[:, None] - centre_m, centre_m - high[:, None]), 0)
+    with np.errstate(invalid="ignore"):
+        return (outside.astype(np.float64) ** 2).sum(-1) <= (radius_m.astype(np.float64) * share) ** 2
+
+
+@dataclass
+class SlowWalk:
+    """Pairs that were found, and tests of existing children and items."""
+
+    pairs: list[tuple[int, int]]
+    child_tests: int = 0
+    item_tests: int = 0
+
+
+def walk(
+    n_items: int,
+    branching: int,
+    n_queries: int,
+    descend: Callable[[int, list[int]], bool],
+    keep: Callable[[int, int], bool],
+) -> SlowWalk:
+    """Query after query down a tree of consecutive items; `descend` sees all items below a child."""
+    levels = [[[item] for item in range(n_items)]]
+    while len(levels[-1]) > 1 or len(levels) == 1:
+        below = levels[-1]
+        levels.append([sum(below[k : k + branching], []) for k in range(0, len(below), branching)])
+    result = SlowWalk([])
+
+    def visit(query: int, level: int, node: int) -> None:
+        children = range(node * branching, min((node + 1) * branching, len(levels[level - 1])))
+        for child in children:
+            if level == 1:
+                result.item_tests += 1
+                if keep(query, child):
+                    result.pairs.append((query, child))
+            else:
+                result.child_tests += 1
+                if descend(query, levels[level - 1][child]):
+                    visit(query, level - 1, child)
+
+    for query in range(n_queries):
+        visit(query, len(levels) - 1, 0)
+    return result
+
+
+def morton_code(x: int, y: int, z: int) -> int:
+    """Bit `s` of x, y, z at `3s`, `3s + 1`, `3s + 2`."""
+    code = 0
+    for s in range(10):
+        for axis, value in enumerate((x, y, z)):
+            code |= (value >> s & 1) << (3 * s + axis)
+    return code
+
+
+def divergence(of_sample: np.ndarray, tile_px: int) -> int:
+    """Runs of 32 samples in tile order, 32 times the longest list of each."""
+    total, (height, width) = 0, of_sample.shape
+    for top in range(0, height, tile_px):
+        for left in range(0, width, tile_px):
+            in_tile = [
+                int(of_sample[y, x]) if y < height and x < width else 0
+                for y in range(top, top + tile_px)
+                for x in range(left, left + tile_px)
+            ]
+            total += sum(32 * max(in_tile[k : k + 32]) for k in range(0, len(in_tile), 32))
+    return total
+
+
+def shading_work(of_block: list[int], batch: int, capacity: int) -> tuple[int, int]:
+    """Lanes and steps of shading, step by step: each chunk goes on until its longest list ends; where one chunk
+    holds all blocks, only its first quarter, sixteenth and 64th go on once the lists of the others have ended."""
+    chunk = min(capacity, max(1, batch // 32)) if batch else capacity
+    ordered = sorted(of_block, reverse=True)
+    lanes = steps = 0
+    for first in range(0, len(ordered), chunk):
+        part = ordered[first : first + chunk]
+        widths = [chunk] if chunk < capacity else [chunk // d for d in (64, 16, 4, 1) if chunk // d]
+        for k in range(max(part)):
+            lit = sum(length > k for length in part)
+            # Once narrow, always narrow: lists only end.
+            lanes += 32 * next(width for width in widths if width >= lit)
+            steps += 1
+    return lanes, steps

@@ -1,0 +1,127 @@
+"""Tiles and depth slices: each sample lies in its slice and in the box of its cell."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+
+from tests import oracles
+from tests.strategies import SMALL, WIDE, a_camera, cameras, random_samples, seeds
+from vtfs.camera import Viewport
+from vtfs.cluster_grid import cell_boxes, cell_keys, cluster_grid, depth_slices, n_cells
+from vtfs.gbuffer import to_runs
+from vtfs.input_error import InputError
+
+some = settings(max_examples=60, deadline=None)
+slices_jit = jax.jit(depth_slices)
+keys_jit, boxes_jit = jax.jit(cell_keys, static_argnums=1), jax.jit(cell_boxes, static_argnums=1)
+tiles = st.integers(2, 256)
+all_slices = st.one_of(st.just(0), st.integers(1, 1024))
+
+
+@given(
+    near_m=st.floats(1e-3, 1e3),
+    ratio=st.floats(1.001, 1e5),
+    fov_y_deg=st.floats(0.1, 170),
+    tile_px=tiles,
+    n_slices=all_slices,
+    share=st.floats(0, 1),
+)
+@example(near_m=0.1, ratio=1e4, fov_y_deg=60, tile_px=2, n_slices=0, share=0.245)  # lands one off with log for log1p
+@example(near_m=0.1, ratio=1e5, fov_y_deg=60, tile_px=32, n_slices=1024, share=1.0)  # the far plane
+@example(near_m=0.1, ratio=1e5, fov_y_deg=60, tile_px=32, n_slices=1024, share=0.0)  # the near plane
+@some
+def test_a_sample_lies_inside_its_slice(near_m, ratio, fov_y_deg, tile_px, n_slices, share):
+    camera = a_camera(WIDE, near_m, near_m * ratio, fov_y_deg)
+    grid = cluster_grid(camera, tile_px, n_slices, 0.0)
+    growth, expected = oracles.n_slices(camera, tile_px, n_slices, camera.far_m)
+    assert int(grid.depth_slices) == expected
+    depth_m = float(np.float32(near_m * (camera.far_m / near_m) ** share))
+    k = int(slices_jit(grid, np.float32(depth_m)))
+    slack = 1e-5  # float32 logs of ratios up to 1e5
+    assert 0 <= k < expected
+    assert near_m * growth**k * (1 - slack) <= depth_m
+    assert depth_m <= near_m * growth ** (k + 1) * (1 + slack)
+
+
+@pytest.mark.parametrize(
+    ("viewport", "tile_px", "ratio", "n_slices"),
+    [(Viewport(1920, 1080), 32, 1e4, 276), (Viewport(1024, 1024), 8, 1e3, 770)],
+)
+def test_the_number_of_cubic_slices_is_the_published_one(viewport, tile_px, ratio, n_slices):
+    # equations.md, section 1, "Size check"
+    grid = cluster_grid(a_camera(viewport, 0.1, 0.1 * ratio, 60.0), tile_px, 0, 0.0)
+    assert int(grid.depth_slices) == n_slices
+    columns, rows = math.ceil(viewport.width_px / tile_px), math.ceil(viewport.height_px / tile_px)
+    assert n_cells(grid, viewport) == columns * rows * n_slices
+
+
+def test_a_cubic_cell_is_as_deep_as_it_is_high():
+    camera = a_camera(Viewport(640, 512), 0.1, 100.0, 60.0)
+    grid = cluster_grid(camera, 16, 0, 0.0)
+    growth = math.exp(float(grid.log_growth))
+    assert 0.1 * (growth - 1) == pytest.approx(2 * 0.1 * math.tan(math.radians(30)) / 32, rel=1e-5)
+
+
+@pytest.mark.parametrize("n_slices", [0, 24])
+def test_an_infinite_far_plane_ends_at_the_deepest_sample(n_slices):
+    camera = a_camera(near_m=0.1, far_m=math.inf)
+    grid, finite = cluster_grid(camera, 8, n_slices, 50.0), cluster_grid(a_camera(near_m=0.1, far_m=50.0), 8, n_slices, 0.0)
+    assert [float(a) for a in jax.tree.leaves(grid)] == [float(a) for a in jax.tree.leaves(finite)]
+    assert int(cluster_grid(camera, 8, n_slices, 0.1).depth_slices) >= 1  # no sample beyond the near plane
+
+
+@pytest.mark.parametrize("viewport", [SMALL, WIDE], ids=str)
+@given(camera=cameras(), tile_px=tiles, n_slices=all_slices, seed=seeds)
+@some
+def test_keys_name_tiles_and_slices_and_boxes_hold_their_samples(viewport, camera, tile_px, n_slices, seed):
+    camera = a_camera(viewport, camera.near_m, camera.far_m, camera.fov_y_deg)
+    samples = random_samples(camera, seed, valid_share=1.0)
+    depth_m = -samples.position_m[..., 2]
+    try:
+        grid = cluster_grid(camera, tile_px, n_slices, float(depth_m.max()))
+    except InputError:
+        assume(False)
+        raise
+    columns, rows = math.ceil(viewport.width_px / tile_px), math.ceil(viewport.height_px / tile_px)
+    total = columns * rows * int(grid.depth_slices)
+    key = oracles.as_image(keys_jit(grid, viewport, jnp.asarray(to_runs(depth_m))), viewport)
+    y, x = np.mgrid[: viewport.height_px, : viewport.width_px]
+    assert (key % columns == x // tile_px).all() and (key // columns % rows == y // tile_px).all()
+    assert (key // (columns * rows) == slices_jit(grid, depth_m)).all() and ((key >= 0) & (key < total)).all()
+    box = boxes_jit(grid, viewport, jnp.asarray(key.ravel()))
+    position_m = samples.position_m.reshape(-1, 3)
+    for c, (low, high) in enumerate(((box.low_x_m, box.high_x_m), (box.low_y_m, box.high_y_m), (box.low_z_m, box.high_z_m))):
+        assert ((low <= position_m[:, c]) & (position_m[:, c] <= high)).all()
+
+
+@given(camera=cameras(), tile_px=st.integers(2, 40))
+@some
+def test_boxes_are_no_larger_than_their_cells_with_slack(camera, tile_px):
+    """Against the corners of the cell in float64 (van Oosten 2017, Alg. 8.1)."""
+    n_slices, far_m = 24, min(camera.far_m, 1e4 * camera.near_m)
+    grid = cluster_grid(camera, tile_px, n_slices, far_m)
+    columns, rows = math.ceil(SMALL.width_px / tile_px), math.ceil(SMALL.height_px / tile_px)
+    key = np.random.default_rng(0).integers(0, columns * rows * n_slices, 64)
+    box = boxes_jit(grid, SMALL, jnp.asarray(key, jnp.int32))
+    growth = (far_m / camera.near_m) ** (1 / n_slices)
+    for n, (i, j, k) in enumerate(zip(key % columns, key // columns % rows, key // (columns * rows), strict=True)):
+        depths = camera.near_m * growth ** float(k), camera.near_m * growth ** float(k + 1)
+        edges_x = [(2 * min(px, SMALL.width_px) / SMALL.width_px - 1) * camera.tan_half_x for px in (i * tile_px, (i + 1) * tile_px)]
+        edges_y = [(1 - 2 * min(px, SMALL.height_px) / SMALL.height_px) * camera.tan_half_y for px in (j * tile_px, (j + 1) * tile_px)]
+        corners = np.array([(x * d, y * d, -d) for x in edges_x for y in edges_y for d in depths])
+        slack = 5e-5 * depths[1] * (1 + camera.tan_half_x)
+        low = np.array([box.low_x_m[n], box.low_y_m[n], box.low_z_m[n]])
+        high = np.array([box.high_x_m[n], box.high_y_m[n], box.high_z_m[n]])
+        assert (np.abs(low - corners.min(0)) <= slack).all() and (np.abs(high - corners.max(0)) <= slack).all()
+        assert (low <= corners.min(0)).all() and (corners.max(0) <= high).all()
+
+
+def test_more_cells_than_keys_are_refused_with_what_to_change():
+    camera = a_camera(Viewport(1920, 1080), 1e-3, 1e5, 10.0)
+    with pytest.raises(InputError, match=r"tile_px=2 with depth_slices=0 makes [\d,]+ cells.*larger tiles or fewer slices"):
+        cluster_grid(camera, 2, 0, 0.0)
