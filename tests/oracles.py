@@ -36,14 +36,19 @@ def windows(samples: ViewSamples, lights: Lights) -> np.ndarray:
     return window
 
 
-def image(samples: ViewSamples, lights: Lights, light_cutoff: float = 0.0) -> np.ndarray:
-    """Blinn-Phong of all lights on all samples, one light after the other: float64 `[h, w, 3]`."""
+def image(
+    samples: ViewSamples, lights: Lights, light_cutoff: float = 0.0, listed: np.ndarray | None = None
+) -> np.ndarray:
+    """Blinn-Phong of all lights on all samples, one light after the other: float64 `[h, w, 3]`.
+
+    `listed`, bool `[h, w, N]`: only these lights count.
+    """
     position_m, normal, base, emissive = (
         channel.astype(np.float64)
         for channel in (samples.position_m, samples.normal, samples.base_colour, samples.emissive)
     )
     specular, shininess = samples.specular.astype(np.float64), samples.shininess.astype(np.float64)
-    window = windows(samples, lights)
+    window = windows(samples, lights) * (1.0 if listed is None else listed)
     total = emissive.copy()
     rotation = samples.camera.view_from_world[:3, :3]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -51,7 +56,7 @@ def image(samples: ViewSamples, lights: Lights, light_cutoff: float = 0.0) -> np
         for n, light_m in enumerate(in_view_space(samples.camera, lights.position_m)):
             to_light = light_m - position_m
             distance = np.linalg.norm(to_light, axis=-1)
-            to_light /= distance[..., None]
+            to_light /= np.maximum(distance, 1e-300)[..., None]  # from no direction at all where a light is in a sample
             half = to_light + to_eye
             half /= np.linalg.norm(half, axis=-1, keepdims=True)
             n_dot_l = np.maximum(0, (normal * to_light).sum(-1))
@@ -180,18 +185,16 @@ def divergence(of_sample: np.ndarray, tile_px: int) -> int:
     return total
 
 
-def shading_work(of_block: list[int], batch: int, capacity: int) -> tuple[int, int]:
+def shading_work(of_block: list[int], chunk: int, capacity: int) -> tuple[int, int]:
     """Lanes and steps of shading, step by step: each chunk goes on until its longest list ends; where one chunk
-    holds all blocks, only its first quarter, sixteenth and 64th go on once the lists of the others have ended."""
-    chunk = min(capacity, max(1, batch // 32)) if batch else capacity
+    holds all blocks, only its first quarter and sixteenth go on once the lists of the others have ended."""
     ordered = sorted(of_block, reverse=True)
     lanes = steps = 0
     for first in range(0, len(ordered), chunk):
         part = ordered[first : first + chunk]
-        widths = [chunk] if chunk < capacity else [chunk // d for d in (64, 16, 4, 1) if chunk // d]
+        widths = [chunk] if chunk < capacity else [chunk // d for d in (16, 4, 1) if chunk // d]
         for k in range(max(part)):
             lit = sum(length > k for length in part)
-            # Once narrow, always narrow: lists only end.
             lanes += 32 * next(width for width in widths if width >= lit)
             steps += 1
     return lanes, steps

@@ -100,14 +100,14 @@ def test_keys_name_tiles_and_slices_and_boxes_hold_their_samples(viewport, camer
 
 
 @given(camera=cameras(), tile_px=st.integers(2, 40))
-@some
+@settings(max_examples=20, deadline=None)
 def test_boxes_are_no_larger_than_their_cells_with_slack(camera, tile_px):
     """Against the corners of the cell in float64 (van Oosten 2017, Alg. 8.1)."""
-    n_slices, far_m = 24, min(camera.far_m, 1e4 * camera.near_m)
+    n_slices, far_m = 24, camera.far_m if math.isfinite(camera.far_m) else 1e4 * camera.near_m
     grid = cluster_grid(camera, tile_px, n_slices, far_m)
     columns, rows = math.ceil(SMALL.width_px / tile_px), math.ceil(SMALL.height_px / tile_px)
     key = np.random.default_rng(0).integers(0, columns * rows * n_slices, 64)
-    box = boxes_jit(grid, SMALL, jnp.asarray(key, jnp.int32))
+    sides = np.array(jax.tree.leaves(boxes_jit(grid, SMALL, jnp.asarray(key, jnp.int32))))
     growth = (far_m / camera.near_m) ** (1 / n_slices)
     for n, (i, j, k) in enumerate(zip(key % columns, key // columns % rows, key // (columns * rows), strict=True)):
         depths = camera.near_m * growth ** float(k), camera.near_m * growth ** float(k + 1)
@@ -115,8 +115,7 @@ def test_boxes_are_no_larger_than_their_cells_with_slack(camera, tile_px):
         edges_y = [(1 - 2 * min(px, SMALL.height_px) / SMALL.height_px) * camera.tan_half_y for px in (j * tile_px, (j + 1) * tile_px)]
         corners = np.array([(x * d, y * d, -d) for x in edges_x for y in edges_y for d in depths])
         slack = 5e-5 * depths[1] * (1 + camera.tan_half_x)
-        low = np.array([box.low_x_m[n], box.low_y_m[n], box.low_z_m[n]])
-        high = np.array([box.high_x_m[n], box.high_y_m[n], box.high_z_m[n]])
+        low, high = sides[:3, n], sides[3:, n]
         assert (np.abs(low - corners.min(0)) <= slack).all() and (np.abs(high - corners.max(0)) <= slack).all()
         assert (low <= corners.min(0)).all() and (corners.max(0) <= high).all()
 

@@ -63,8 +63,8 @@ def check_none_is_missing(technique, params, samples, lights, light_cutoff=0.0):
 kinds = st.one_of(st.just(LIGHT_KINDS), st.sampled_from([(kind,) for kind in LIGHT_KINDS]))
 tiles = st.sampled_from([2, 3, 8, 16, 32, 256])
 slices = st.sampled_from([0, 0, 1, 24, 1024])
-some = settings(max_examples=40, deadline=None)
-few = settings(max_examples=12, deadline=None)
+some = settings(max_examples=30, deadline=None)
+few = settings(max_examples=8, deadline=None)
 
 
 @given(camera=cameras(), tile_px=tiles, kinds=kinds, seed=seeds)
@@ -92,7 +92,7 @@ def test_volume_tiled_bvh_misses_no_light(camera, tile_px, depth_slices, kinds, 
     check_none_is_missing("volume_tiled_bvh", params, samples, lights)
 
 
-@pytest.mark.parametrize("branching", [2, 8, 32, 64])
+@pytest.mark.parametrize("branching", [2, 32, 64])
 @given(camera=cameras(), kinds=kinds, seed=seeds)
 @few
 def test_every_branching_misses_no_light(branching, camera, kinds, seed):
@@ -229,7 +229,7 @@ def lists_of(lists):
 
 
 @pytest.mark.parametrize("how", [by_brute_force, by_tree], ids=["brute_force", "tree"])
-@pytest.mark.parametrize(("n_lights", "branching"), [(1, 2), (37, 2), (37, 64), (200, 8), (200, 32)])
+@pytest.mark.parametrize(("n_lights", "branching"), [(1, 2), (37, 64), (200, 8)])
 @given(spread=st.sampled_from([0.1, 3.0, 1e5]), seed=seeds)
 @few
 def test_lists_are_those_of_float64_within_the_slack(how, n_lights, branching, spread, seed):
