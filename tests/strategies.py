@@ -88,6 +88,19 @@ def surface_samples(camera: Camera, seed: int, valid_share: float = 0.9) -> View
     return samples_at(camera, depth_m, rng.random((height, width)) < valid_share, rng)
 
 
+def samples_in_slices(
+    viewport: Viewport, n_slices: int, seed: int, valid_share: float = 0.8
+) -> tuple[ViewSamples, np.ndarray]:
+    """Samples well inside known slices `[h, w]`, so that float32 and float64 agree on the slice."""
+    rng = np.random.default_rng(seed)
+    camera = a_camera(viewport, 0.1, 100.0)
+    shape = (viewport.height_px, viewport.width_px)
+    slices = rng.integers(rng.integers(n_slices), n_slices, shape)
+    growth = (camera.far_m / camera.near_m) ** (1 / n_slices)
+    depth_m = camera.near_m * growth ** (slices + rng.uniform(0.05, 0.95, shape))
+    return samples_at(camera, depth_m, rng.random(shape) < valid_share, rng), slices
+
+
 def no_lights() -> Lights:
     return Lights(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
 

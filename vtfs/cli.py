@@ -7,7 +7,7 @@ import logging
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -18,7 +18,6 @@ app = typer.Typer(
     name="vtfs",
     help="Which many-light technique and which parameters are right for your scene on your device: "
     "count, measure, model, search, report.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -50,18 +49,40 @@ JsonOption = Annotated[str | None, typer.Option("--json", help="Write the result
 VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Say more of what is done, on stderr.")]
 
 
+_UsageError = typer.BadParameter.__mro__[1]
+"""Click's, or that of typer where it brings its own copy of Click."""
+
+_INTERRUPTED = 130
+
+
 def main() -> None:
     """Run the command line. Bad input is one line on stderr and exit code 2."""
+    arguments = sys.argv[1:]
     try:
-        app(standalone_mode=True)
+        code = app(arguments or ["--help"], prog_name="vtfs", standalone_mode=False)
     except InputError as error:
-        print(f"vtfs: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+        _leave(str(error), 2)
+    except _UsageError as error:
+        _leave(f"{error.format_message().rstrip('.')}; see vtfs {_command_of(arguments)}--help.", 2)
+    except (KeyboardInterrupt, typer.Abort):
+        code = _INTERRUPTED
     except BrokenPipeError:
-        sys.exit(1)
-    except KeyboardInterrupt:
-        print("vtfs: interrupted; what was measured is kept, --resume goes on from there.", file=sys.stderr)
-        sys.exit(130)
+        code = 1
+    if code == _INTERRUPTED:
+        kept = "; what was measured is kept, --resume goes on from there" if _command_of(arguments) == "tune " else ""
+        _leave(f"interrupted{kept}.", _INTERRUPTED)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _leave(message: str, code: int) -> NoReturn:
+    print(f"vtfs: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _command_of(arguments: list[str]) -> str:
+    """The command that was named, and a space; nothing where there is none."""
+    names = {command.callback.__name__ for command in app.registered_commands if command.callback}
+    return f"{arguments[0]} " if arguments and arguments[0] in names else ""
 
 
 @app.command()
@@ -91,14 +112,14 @@ def tune(
         raise InputError(f"--objective {objective}: must be max or mean.")
     if max_error is not None and not max_error >= 0:
         raise InputError(f"--max-error {max_error}: must be 0 or more.")
-    # Cheap to check, and dear to find out after minutes of measuring.
-    _check_folder(out, resume)
     from tuning.space import load_space
     from tuning.sweep import Budget
     from vtfs.device import keep_compiled_programs
 
-    budget_parsed = Budget.parse(budget) if budget else None
+    budget_parsed = Budget.parse(budget) if budget is not None else None
     own_space = load_space(space, names) if space else None
+    # Cheap to check, and dear to find out after minutes of measuring.
+    _check_folder(out, resume)
     setup = _setup(scene, cameras, lights, size, seed, lights_per_sample, density, triangles)
     keep_compiled_programs()
     from reports.page import write_report
@@ -148,7 +169,7 @@ def count(
 
         configs = load_space(space, (technique,)).configurations()
     setup = _setup(scene, cameras, lights, size, seed, lights_per_sample, density, triangles)
-    frames = tuple(frame) if frame else tuple(range(setup.n_frames))
+    frames = tuple(dict.fromkeys(frame)) if frame else tuple(range(setup.n_frames))
     from vtfs.count_table import count_frames, counts_csv, print_counts
     from vtfs.device import keep_compiled_programs
 
@@ -205,7 +226,7 @@ def render(
 
     keep_compiled_programs()
     written: list[dict[str, Any]] = []
-    for number in frame or [0]:
+    for number in dict.fromkeys(frame or [0]):
         with _Status() as status:
             status.say(f"frame {number}")
             inputs = FrameInputs(setup.samples(number), setup.lights)
@@ -298,6 +319,8 @@ def _setup(
 ):
     if density not in ("constant", "fixed"):
         raise InputError(f"--density {density}: must be constant or fixed.")
+    if seed < 0:
+        raise InputError(f"--seed {seed}: must be 0 or more.")
     viewport = _viewport(size)
     from vtfs.scene_setup import SceneOptions, set_up
 
@@ -340,7 +363,11 @@ def _check_folder(folder: Path, resume: bool) -> None:
     from vtfs.files import write_atomically
 
     probe = folder / ".vtfs-writable"
-    write_atomically(probe, b"")
+    try:
+        write_atomically(probe, b"")
+    except InputError as error:
+        reason = getattr(error.__cause__, "strerror", error)
+        raise InputError(f"--out {folder}: is no folder that can be written ({reason}); choose another one.") from error
     probe.unlink()
     if not resume and (folder / "measurements.jsonl").exists():
         raise InputError(f"{folder}: holds the measurements of an earlier run; go on with --resume, or name another --out.")
@@ -372,16 +399,14 @@ def _recommendation(result: dict[str, Any]) -> str:
     best, gain = result["best"], result["gain"]
     changed = [f"{name}={value}" for name, value in best["params"].items() if value != PARAMETERS[name].default]
     low, high = best["time_ms_interval"]
-    lines = [
-        f"{best['technique']} {' '.join(changed)}: {best['time_ms']:.1f} ms a frame ({low:.1f} to {high:.1f})".replace("  ", " ")
-    ]
+    lines = [f"{' '.join([best['technique'], *changed])}: {best['time_ms']:.1f} ms a frame ({low:.1f} to {high:.1f})"]
     for role, words in (("default", "its default"), ("fastest_default", "the fastest default")):
         if f"over_{role}" in gain:
             low, high = gain[f"over_{role}_interval"]
             lines.append(f"  {gain[f'over_{role}']:.2f} times as fast as {words} ({low:.2f} to {high:.2f})")
     lines.append(f"  {result['claim']}")
     lines.append(
-        f"  {result['measured']} of {result['space_size']} configurations measured, "
+        f"  {result['measured']} configurations measured (the space has {result['space_size']}), "
         f"{result['compiled_programs']} programs compiled, {result['wall_s']:.0f} s: {result['stop_reason']}"
     )
     return "\n".join(lines)

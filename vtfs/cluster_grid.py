@@ -18,6 +18,9 @@ _BOX_SLACK = 1e-5
 """How far, relative to its depth, a sample may lie outside its cell: float32 logs of depth ratios up to
 1e5 put a slice's planes off by 3e-6, and pixel slopes are right to 1e-6."""
 
+_PIXEL_SLACK_PX = 0.02
+"""A user's G-buffer may have positions up to 0.01 pixels outside their own pixel."""
+
 MAX_CELLS = 2**31 - 1
 
 
@@ -142,8 +145,9 @@ def cell_boxes(
     left_px, top_px = i * grid.tile_px, j * grid.tile_px
     right_px = jnp.minimum(left_px + grid.tile_px, viewport.width_px)
     bottom_px = jnp.minimum(top_px + grid.tile_px, viewport.height_px)
-    left, right = (grid.slope_x + x_px * grid.slope_per_px for x_px in (left_px, right_px))
-    top, bottom = (grid.slope_y - y_px * grid.slope_per_px for y_px in (top_px, bottom_px))
+    slack_px = _PIXEL_SLACK_PX
+    left, right = (grid.slope_x + x_px * grid.slope_per_px for x_px in (left_px - slack_px, right_px + slack_px))
+    top, bottom = (grid.slope_y - y_px * grid.slope_per_px for y_px in (top_px - slack_px, bottom_px + slack_px))
     slack_m = _BOX_SLACK * far_m
     return Aabb(
         jnp.minimum(left * near_m, left * far_m) - slack_m,

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vtfs.bit_lists import last_not_above
-from vtfs.bounds import Sphere
+from vtfs.bounds import SLACK, Sphere
 
 if TYPE_CHECKING:
     from vtfs.camera import Camera
@@ -34,15 +34,19 @@ class ViewLights(eqx.Module):
         return self.row.shape[0]
 
     def spheres(self, light_cutoff: Float[Array, ""]) -> Sphere:
-        """Where each light's window is above `light_cutoff`; lights without range reach nothing."""
+        """Where each light's window is above `light_cutoff`; lights without range reach nothing.
+
+        Grown by the rounding of the centre: a box that is a single sample has no slack of its own.
+        """
         x, y, z, range_m = (self.row[:, c] for c in (0, 1, 2, 7))
-        nowhere = jnp.inf
-        return Sphere(jnp.where(range_m > 0, x, nowhere), y, z, range_m * reach_of_cutoff(light_cutoff))
+        radius_m = range_m * reach_of_cutoff(light_cutoff) + SLACK * (jnp.abs(x) + jnp.abs(y) + jnp.abs(z))
+        return Sphere(jnp.where(range_m > 0, x, jnp.inf), y, z, radius_m)
 
 
 def reach_of_cutoff(light_cutoff: Float[Array, ""]) -> Float[Array, ""]:
     """Share of the range within which the window `(1 - (d/range)**4)**2` is above the cut-off."""
-    return jnp.sqrt(jnp.sqrt(1 - jnp.sqrt(light_cutoff)))
+    # 1 - sqrt(c) without its cancellation near 1.
+    return jnp.sqrt(jnp.sqrt((1 - light_cutoff) / (1 + jnp.sqrt(light_cutoff))))
 
 
 def view_lights(lights: Lights, camera: Camera) -> ViewLights:

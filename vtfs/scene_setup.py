@@ -26,6 +26,7 @@ DEFAULT_SCENE = "atrium"
 DEFAULT_LIGHTS = 1000
 DEFAULT_VIEWPORT = Viewport(1280, 720)
 MAX_COUNTED_FRAMES = 12
+MAX_SCATTERED_LIGHTS = 10_000_000
 
 _SCATTER_SAMPLES = 512  # of each counted frame: a median over some 6,000 is known to 2 %
 
@@ -196,8 +197,8 @@ def _given_lights(given: str | None) -> Lights | int | None:
         n_lights = int(given)
     except ValueError:
         return load_lights(given)
-    if n_lights < 0:
-        raise InputError(f"lights {n_lights}: must be a lights.csv, or a number of lights that is 0 or more.")
+    if not 0 <= n_lights <= MAX_SCATTERED_LIGHTS:
+        raise InputError(f"lights {n_lights}: must be a lights.csv, or a number of lights from 0 to {MAX_SCATTERED_LIGHTS:,}.")
     return n_lights
 
 

@@ -15,7 +15,7 @@ from vtfs.wide_tree import build_tree, inner_level_nodes, n_child_tests, n_leaf_
 
 SHAPES = [(1, 2), (37, 2), (64, 8), (65, 8), (37, 64), (513, 8)]
 N_QUERIES, CAPACITY, CHUNK = 20, 2**14, 128
-some = settings(max_examples=8, deadline=None)
+some = settings(max_examples=6, deadline=None)
 
 
 def random_boxes(n, rng, spread=10.0):

@@ -11,6 +11,9 @@ from vtfs.light_lists import AssignCounts, LightLists, lists_from_pairs
 from vtfs.wide_tree import in_leaf_nodes, n_leaf_nodes
 
 
+_MAX_ROWS = 2**30  # the last chunk starts below 2^31
+
+
 def assign_brute_force(
     lights: Sphere, clusters: Clusters, capacity: int, chunk: int
 ) -> tuple[LightLists, AssignCounts]:
@@ -31,9 +34,11 @@ def assign_brute_force(
     def emit(row, bit):
         return row // n_words, row % n_words * WORD_BITS + bit
 
-    n_rows = clusters.n_clusters * n_words
+    # More rows than 31 bits count do not fit, like pairs beyond the capacity.
+    too_many = clusters.n_clusters > _MAX_ROWS // n_words
+    n_rows = jnp.where(too_many, 0, clusters.n_clusters * n_words)
     (cluster, light), total = gather_hits(n_rows, test, emit, 2, capacity, chunk)
-    lists = lists_from_pairs(cluster, light, total, total > capacity, clusters.key.shape[0])
+    lists = lists_from_pairs(cluster, light, total, (total > capacity) | too_many, clusters.key.shape[0])
     none = jnp.zeros(0, jnp.int32)
     return lists, AssignCounts(none, none, n_rows, clusters.n_clusters)
 

@@ -1,0 +1,104 @@
+"""Running `vtfs` as its user does: in this process, or in one of its own (three seconds of imports)."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import json
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+ROOT = Path(__file__).parents[1]
+
+STREET = ("street", "--triangles", "1000", "--size", "64x36")
+SMALL = (*STREET, "--lights", "20")
+"""Its programs are compiled once for all tests: shapes depend on the size and on the number of lights."""
+
+_FRAME_CAP_S = 0.02
+"""On a busy machine a frame of a millisecond is repeated for the whole two seconds; here that decides nothing."""
+
+_PROGRAM = f"""
+import functools, sys
+from vtfs.cli import main
+if sys.argv[1:2] == ["tune"]:
+    import tuning.workload as workload
+    workload.repeats_ms = functools.partial(workload.repeats_ms, cap_s={_FRAME_CAP_S})
+    workload._DUEL_CAP_S = {_FRAME_CAP_S}
+main()
+"""
+
+
+@dataclass(frozen=True)
+class Ran:
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.out)
+
+
+def vtfs(*arguments: object) -> Ran:
+    """`vtfs ARGUMENTS` in this process. A defect of ours, a traceback to the user, is raised."""
+    out, err, log = io.StringIO(), io.StringIO(), logging.getLogger("vtfs")
+    level, code = log.level, 0
+    with (
+        mock.patch.object(sys, "argv", ["vtfs", *map(str, arguments)]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        from vtfs.cli import main
+
+        try:
+            main()
+        except SystemExit as left:
+            code = left.code if isinstance(left.code, int) else int(left.code is not None)
+        finally:
+            log.setLevel(level)
+    return Ran(code, out.getvalue(), err.getvalue())
+
+
+def started(*arguments: object, folder: Path) -> subprocess.Popen[str]:
+    """`vtfs ARGUMENTS` in a process of its own, with `folder` as its working directory."""
+    return subprocess.Popen(
+        [sys.executable, "-c", _PROGRAM, *map(str, arguments)],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "default"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finished(process: subprocess.Popen[str]) -> Ran:
+    out, err = process.communicate(timeout=120)
+    return Ran(process.returncode, out, err)
+
+
+@contextlib.contextmanager
+def short_repeats() -> Iterator[None]:
+    """A `tune` that takes a second."""
+    from tuning.timing import repeats_ms
+
+    quick = functools.partial(repeats_ms, cap_s=_FRAME_CAP_S)
+    with mock.patch("tuning.workload.repeats_ms", quick), mock.patch("tuning.workload._DUEL_CAP_S", _FRAME_CAP_S):
+        yield
+
+
+def is_refused(ran: Ran, *words: str) -> None:
+    """Exit code 2 and one line on stderr that holds all `words`; nothing on stdout."""
+    assert ran.code == 2, ran
+    assert ran.err.startswith("vtfs: ") and ran.err.count("\n") == 1 and ran.err.endswith("\n"), ran.err
+    assert "Traceback" not in ran.err and len(ran.err) < 500
+    for word in words:
+        assert word in ran.err, (word, ran.err)
+    assert ran.out == ""
