@@ -28,7 +28,10 @@ def run(out: Path, cache: Path, arguments: list[str]) -> dict[str, object]:
     return {
         "wall_s": round(wall_s, 1),
         "peak_gb": round(peak_kb / 1e6, 2),
-        **{key: result[key] for key in ("compiled_programs", "compile_s", "measured", "space_size", "stop_reason", "device")},
+        **{
+            key: result[key]
+            for key in ("compiled_programs", "compile_s", "measured", "space_size", "stop_reason", "device")
+        },
         **{key: result[key] for key in ("best", "default", "fastest_default", "gain")},
     }
 

@@ -1,6 +1,6 @@
 """Where a frame's time goes: stages, lanes and steps of the atrium's busiest view, by technique and batch.
 
-    python benchmarks/shading.py [BATCH,BATCH,...]
+python benchmarks/shading.py [BATCH,BATCH,...]
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ def main() -> None:
             stages = {}
             for stage in REGISTRY[technique].stages:
                 own = stage_program(stage, narrowed(stage, planned(config, sizes)))
-                stages[stage.name] = median_ms(lambda own=own, stage=stage, env=env: own(*(env[n] for n in stage.needs)))
+                stages[stage.name] = median_ms(
+                    lambda own=own, stage=stage, env=env: own(*(env[n] for n in stage.needs))
+                )
             print(
                 f"{technique} batch={batch}: frame {frame_ms:.2f} ms; "
                 + ", ".join(f"{name} {ms:.2f}" for name, ms in stages.items())

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
-EXACT_BELOW = 1e-7
+from tuning.measurement import FLOAT32_ERROR
+
+EXACT_BELOW = FLOAT32_ERROR
 """An image whose error is below this differs from the float64 reference by float32 rounding alone."""
 
 _SPACE = "\u00a0"

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import bdtr, ndtr
 
 from tuning.cost_model import CostModel
-from tuning.measurement import Measurement
+from tuning.measurement import FLOAT32_ERROR, Measurement
 from tuning.space import Space
 from vtfs.parameters import Configuration, Value, configuration
 
@@ -164,8 +164,15 @@ def predict_ms(model: CostModel, counts: Sequence[Counts], objective: Objective)
 
 
 def pareto_front(measurements: Iterable[Measurement], objective: Objective) -> tuple[Measurement, ...]:
-    """Those that no other beats in both time and error, fastest first; what has no error is left out."""
-    points = [(time_ms(m, objective), m.error, m) for m in measurements if is_timed(m) and m.error is not None]
+    """Those that no other beats in both time and error, fastest first; what has no error is left out.
+
+    Errors that are rounding alone count as equal.
+    """
+    points = [
+        (time_ms(m, objective), max(m.error, FLOAT32_ERROR), m)
+        for m in measurements
+        if is_timed(m) and m.error is not None
+    ]
     front: list[Measurement] = []
     least = math.inf
     for _, error, measurement in sorted(points, key=lambda point: point[:2]):

@@ -79,9 +79,7 @@ def operations(counts: Sequence[Mapping[str, int]], terms: Sequence[str]) -> np.
     return table
 
 
-def stage_times(
-    measurements: Iterable[Measurement], stage: str, available: frozenset[str] | None = None
-) -> StageTimes:
+def stage_times(measurements: Iterable[Measurement], stage: str, available: frozenset[str] | None = None) -> StageTimes:
     """The data of one stage, from the measurements that timed it.
 
     A term is a candidate where every row has it and not all rows have the same value (then it is a constant).

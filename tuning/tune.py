@@ -110,9 +110,7 @@ def tune(
         "fastest_default": times.get("fastest_default"),
         "best": times["best"],
         "gain": gain,
-        "pareto": [
-            _timed(m, options.objective) | {"error": m.error, "error_p999": m.error_p999} for m in found.pareto
-        ],
+        "pareto": [_timed(m, options.objective) | {"error": m.error, "error_p999": m.error_p999} for m in found.pareto],
         "not_measured": [
             {"technique": name, "reason": reason} for name, reason in (found.not_measured | found.not_explored).items()
         ],

@@ -94,7 +94,9 @@ class SceneWorkload:
         # bits, counts do not depend on the G-buffer's precision either.
         canonical = config.replaced(batch=0, gbuffer="float32")
         if (canonical, i) not in self._counted:
-            self._counted[canonical, i] = cached_counts(canonical, self.scene_key, self.frames[i], lambda: self._inputs[i])
+            self._counted[canonical, i] = cached_counts(
+                canonical, self.scene_key, self.frames[i], lambda: self._inputs[i]
+            )
         return self._counted[canonical, i].at_batch(int(config["batch"]))
 
     def measure(self, config: Configuration, best_ms: float | None, /) -> Measurement:
@@ -183,7 +185,12 @@ class SceneWorkload:
         frames: list[tuple[float, ...]] = []
         slowest_low = 0.0
         for i in range(len(self._inputs)):
-            if frames and best_ms is not None and self._objective == "max" and median_interval(frames[0])[0] > LOST * best_ms:
+            if (
+                frames
+                and best_ms is not None
+                and self._objective == "max"
+                and median_interval(frames[0])[0] > LOST * best_ms
+            ):
                 frames.append(())  # it lost on the first frame: the others cannot make it faster
                 continue
 
@@ -261,9 +268,7 @@ class _Taken:
         self.stages_ms, self.counts, self.error, self.error_p999 = {}, (), None, None
 
 
-def cached_counts(
-    config: Configuration, scene_key: str, frame: int, inputs: Callable[[], FrameInputs]
-) -> FrameCounts:
+def cached_counts(config: Configuration, scene_key: str, frame: int, inputs: Callable[[], FrameInputs]) -> FrameCounts:
     """Counts of a frame, on disk between runs: counting a space costs as much as measuring a part of it.
 
     They depend on the device only by rounding at the edges of lights and cells, but are kept apart for each.

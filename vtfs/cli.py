@@ -32,7 +32,10 @@ SceneArgument = Annotated[
 ]
 CamerasOption = Annotated[Path | None, typer.Option(help="Camera path: cameras.json.", metavar="FILE")]
 LightsOption = Annotated[
-    str | None, typer.Option(help="lights.csv, or a number of lights to scatter.", metavar="FILE|N", show_default="the scene's, else 1000")
+    str | None,
+    typer.Option(
+        help="lights.csv, or a number of lights to scatter.", metavar="FILE|N", show_default="the scene's, else 1000"
+    ),
 ]
 SizeOption = Annotated[str | None, typer.Option(help="Image size, as 1280x720.", metavar="WxH")]
 SeedOption = Annotated[int, typer.Option(help="Of everything that is random.")]
@@ -43,9 +46,13 @@ DensityOption = Annotated[
     str, typer.Option(help="Where lights are scattered: `constant`: in the scene's box; `fixed`: one a cubic metre.")
 ]
 TrianglesOption = Annotated[int | None, typer.Option(help="Size of a built-in scene, 1,000 to 1,000,000 triangles.")]
-SetOption = Annotated[list[str] | None, typer.Option("--set", help="A parameter, as tile_px=16. Repeatable.", metavar="NAME=VALUE")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", help="A parameter, as tile_px=16. Repeatable.", metavar="NAME=VALUE")
+]
 TechniqueOption = Annotated[str, typer.Option(help=f"One of {', '.join(TECHNIQUES)}.")]
-JsonOption = Annotated[str | None, typer.Option("--json", help="Write the result here as JSON; - is stdout.", metavar="FILE")]
+JsonOption = Annotated[
+    str | None, typer.Option("--json", help="Write the result here as JSON; - is stdout.", metavar="FILE")
+]
 VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Say more of what is done, on stderr.")]
 
 
@@ -91,13 +98,28 @@ def tune(
     cameras: CamerasOption = None,
     lights: LightsOption = None,
     size: SizeOption = None,
-    techniques: Annotated[str | None, typer.Option(help="Comma-separated; default: all that counting finds worth measuring.", metavar="A,B")] = None,
+    techniques: Annotated[
+        str | None,
+        typer.Option(help="Comma-separated; default: all that counting finds worth measuring.", metavar="A,B"),
+    ] = None,
     space: Annotated[Path | None, typer.Option(help="Search space as TOML.", metavar="FILE")] = None,
-    budget: Annotated[str | None, typer.Option(help="Measurements, as 40, or seconds of measuring, as 120s.", show_default="90s")] = None,
-    objective: Annotated[str, typer.Option(help="`max`: the slowest frame decides; `mean`: the mean of the frames.")] = "max",
-    max_error: Annotated[float | None, typer.Option(help="Allow settings whose image has at most this error (RMSE over RMS).", show_default="exact settings only")] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="Measurements, as 40, or seconds of measuring, as 120s.", show_default="90s")
+    ] = None,
+    objective: Annotated[
+        str, typer.Option(help="`max`: the slowest frame decides; `mean`: the mean of the frames.")
+    ] = "max",
+    max_error: Annotated[
+        float | None,
+        typer.Option(
+            help="Allow settings whose image has at most this error (RMSE over RMS).",
+            show_default="exact settings only",
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the report.", metavar="DIR")] = Path("vtfs-report"),
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the measurements that are in the folder.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the measurements that are in the folder.")
+    ] = False,
     seed: SeedOption = 0,
     lights_per_sample: PerSampleOption = 20,
     density: DensityOption = "constant",
@@ -126,7 +148,15 @@ def tune(
     from tuning.tune import DEFAULT_BUDGET, TuneOptions, tune
 
     options = TuneOptions(
-        out, names, names if techniques else (), own_space, budget_parsed or DEFAULT_BUDGET, objective, max_error, seed, _command()  # type: ignore[arg-type]
+        out,
+        names,
+        names if techniques else (),
+        own_space,
+        budget_parsed or DEFAULT_BUDGET,
+        objective,
+        max_error,
+        seed,
+        _command(),  # type: ignore[arg-type]
     )
     with _Status() as status:
         result = tune(setup, options, status.say, status.search)
@@ -143,8 +173,12 @@ def count(
     scene: SceneArgument = None,
     technique: TechniqueOption = "tiled_deferred",
     settings: SetOption = None,
-    frame: Annotated[list[int] | None, typer.Option(help="Only this frame of the path. Repeatable.", show_default="all")] = None,
-    space: Annotated[Path | None, typer.Option(help="Count every configuration of this space (TOML).", metavar="FILE")] = None,
+    frame: Annotated[
+        list[int] | None, typer.Option(help="Only this frame of the path. Repeatable.", show_default="all")
+    ] = None,
+    space: Annotated[
+        Path | None, typer.Option(help="Count every configuration of this space (TOML).", metavar="FILE")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="With --space: the CSV file to write.", metavar="FILE")] = None,
     cameras: CamerasOption = None,
     lights: LightsOption = None,
@@ -160,7 +194,9 @@ def count(
     _log(verbose)
     config = _configuration(technique, settings)
     if out and not space:
-        raise InputError("--out goes with --space: it is the table of a space's counts; use --json for one configuration.")
+        raise InputError(
+            "--out goes with --space: it is the table of a space's counts; use --json for one configuration."
+        )
     if out:
         _check_folder(out.parent, resume=True)
     configs = (config,)
@@ -175,7 +211,9 @@ def count(
 
     keep_compiled_programs()
     with _Status() as status:
-        rows = count_frames(setup, configs, frames, lambda done, total: status.share(f"counting {done} of {total}", done / total))
+        rows = count_frames(
+            setup, configs, frames, lambda done, total: status.share(f"counting {done} of {total}", done / total)
+        )
     if space and out:
         from vtfs.files import write_atomically
 
@@ -186,7 +224,12 @@ def count(
         {
             "technique": c.technique,
             "params": c.params,
-            "scene": {"name": setup.name, "triangles": setup.n_triangles, "lights": setup.lights.n_lights, "key": setup.key},
+            "scene": {
+                "name": setup.name,
+                "triangles": setup.n_triangles,
+                "lights": setup.lights.n_lights,
+                "key": setup.key,
+            },
             "frames": [{"frame": row.frame, **row.counts} for row in rows if row.configuration == c],
         }
         for c in configs
@@ -238,9 +281,13 @@ def render(
         write_png(paths[0], tone_map(image, exposure(image, valid)))
         write_png(paths[1], heat_map(lengths.of_sample, largest, valid))
         mean = float(lengths.of_sample[valid].mean()) if valid.any() else 0.0
-        written.append({"frame": number, "image": str(paths[0]), "heat_map": str(paths[1]), "largest": largest, "mean": mean})
+        written.append(
+            {"frame": number, "image": str(paths[0]), "heat_map": str(paths[1]), "largest": largest, "mean": mean}
+        )
         if json_file != "-":
-            print(f"{paths[0]}\n{paths[1]}  (lighting computations per pixel: {mean:.1f} in the mean, at most {largest})")
+            print(
+                f"{paths[0]}\n{paths[1]}  (lighting computations per pixel: {mean:.1f} in the mean, at most {largest})"
+            )
     _write_json(json_file, {"technique": config.technique, "params": config.params, "pictures": written})
 
 
@@ -370,7 +417,9 @@ def _check_folder(folder: Path, resume: bool) -> None:
         raise InputError(f"--out {folder}: is no folder that can be written ({reason}); choose another one.") from error
     probe.unlink()
     if not resume and (folder / "measurements.jsonl").exists():
-        raise InputError(f"{folder}: holds the measurements of an earlier run; go on with --resume, or name another --out.")
+        raise InputError(
+            f"{folder}: holds the measurements of an earlier run; go on with --resume, or name another --out."
+        )
 
 
 def _write_json(target: str | None, value: object) -> None:
@@ -421,7 +470,12 @@ class _Status:
 
         console = Console(stderr=True)
         self._progress = Progress(
-            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
         )
         self._progress.start()
         self._task = self._progress.add_task("", total=None)
@@ -439,5 +493,3 @@ class _Status:
     def search(self, state: Any) -> None:
         best = "" if state.best_ms is None else f", best {state.best_ms:.1f} ms"
         self.share(f"{state.n_measured} measured{best}; now {state.configuration}", min(state.spent, 1.0))
-
-

@@ -89,7 +89,8 @@ def form_clusters(
             box = cell_boxes(grid, positions.viewport, cluster_key, depths)
         else:
             (low_x, high_x), (low_y, high_y), (low_z, high_z) = (
-                _extent(component[block_run], in_block, target) for component in (positions.x_m, positions.y_m, positions.z_m)
+                _extent(component[block_run], in_block, target)
+                for component in (positions.x_m, positions.y_m, positions.z_m)
             )
             box = Aabb(low_x, low_y, low_z, high_x, high_y, high_z)
     return Clusters(

@@ -49,7 +49,9 @@ def counts_csv(rows: Sequence[CountRow]) -> str:
     writer = csv.DictWriter(text, ["technique", *params, "frame", *names], lineterminator="\n")
     writer.writeheader()
     for row in rows:
-        writer.writerow({"technique": row.configuration.technique, **row.configuration.params, "frame": row.frame, **row.counts})
+        writer.writerow(
+            {"technique": row.configuration.technique, **row.configuration.params, "frame": row.frame, **row.counts}
+        )
     return text.getvalue()
 
 
@@ -58,7 +60,15 @@ def print_counts(rows: Sequence[CountRow]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    shown = ("samples", "clusters_occupied", "light_cluster_pairs", "lighting_computations", "divergence", "tree_tests", "leaf_tests")
+    shown = (
+        "samples",
+        "clusters_occupied",
+        "light_cluster_pairs",
+        "lighting_computations",
+        "divergence",
+        "tree_tests",
+        "leaf_tests",
+    )
     names = [name for name in shown if any(name in row.counts for row in rows)]
     table = Table(box=None, pad_edge=False)
     table.add_column("configuration")

@@ -227,9 +227,7 @@ class FrameCounts:
         return cls(technique, arrays["of_block"], walk_rows, int(arrays["branching"]), sizes)
 
 
-def count(
-    config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
-) -> tuple[FrameCounts, ListLengths]:
+def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None) -> tuple[FrameCounts, ListLengths]:
     """Count what a configuration does on a frame; nothing is shaded."""
     if is_listed(config):
         env, sizes = run_stages(config, inputs, sizes, until="assign")

@@ -13,9 +13,7 @@ BITS = 10  # per axis: van Oosten 2017, Alg. 6.3
 LARGEST = 2**BITS - 1
 
 
-def morton_codes(
-    spheres: Sphere, low_m: Float[Array, "3"], high_m: Float[Array, "3"]
-) -> UInt32[Array, " spheres"]:
+def morton_codes(spheres: Sphere, low_m: Float[Array, 3], high_m: Float[Array, 3]) -> UInt32[Array, " spheres"]:
     """30-bit codes of the centres within a box; centres outside are clamped to it.
 
     `q = (p - low) / (high - low) * (2**10 - 1)`, bit `s` of x, y, z at `3s`, `3s + 1`, `3s + 2` (van Oosten 2017,

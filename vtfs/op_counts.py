@@ -64,7 +64,9 @@ def shading_counts(lengths: ListLengths, n_samples: int, tile_px: int) -> OpCoun
     }
 
 
-def batch_counts(of_block: np.ndarray, walk_rows: tuple[int, ...], batch: int, capacity: int, walk_chunk: int) -> OpCounts:
+def batch_counts(
+    of_block: np.ndarray, walk_rows: tuple[int, ...], batch: int, capacity: int, walk_chunk: int
+) -> OpCounts:
     """What this implementation pays for its chunks.
 
     - `shading_lanes`, `shading_steps`: lanes of all chunks times their longest list, and the steps of the loops.

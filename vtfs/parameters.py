@@ -71,9 +71,19 @@ PARAMETERS: dict[str, Parameter] = {
         Parameter("tile_px", 32, "width and height of a tile in pixels", low=2, high=256),
         Parameter("depth_slices", 0, "depth slices of the grid; 0: as many as make cells cubic", low=0, high=1024),
         Parameter("branching", 32, "children of a node of the light tree", choices=(2, 4, 8, 16, 32, 64)),
-        Parameter("batch", 0, "queries in one chunk: clusters when assigning, samples when shading; 0: all at once (on a CPU: what fits its cache)", choices=_BATCHES),
+        Parameter(
+            "batch",
+            0,
+            "queries in one chunk: clusters when assigning, samples when shading; 0: all at once (on a CPU: what fits its cache)",
+            choices=_BATCHES,
+        ),
         Parameter("bounds", "implicit", "what stands for the samples of a cell", choices=("implicit", "explicit")),
-        Parameter("gbuffer", "float32", "precision of G-buffer channels; depth stays float32", choices=("float32", "float16", "bfloat16")),
+        Parameter(
+            "gbuffer",
+            "float32",
+            "precision of G-buffer channels; depth stays float32",
+            choices=("float32", "float16", "bfloat16"),
+        ),
         Parameter("light_cutoff", 0.0, "lights reach only where their window is above this", low=0.0, high=0.99),
     )
 }

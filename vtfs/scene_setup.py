@@ -198,7 +198,9 @@ def _given_lights(given: str | None) -> Lights | int | None:
     except ValueError:
         return load_lights(given)
     if not 0 <= n_lights <= MAX_SCATTERED_LIGHTS:
-        raise InputError(f"lights {n_lights}: must be a lights.csv, or a number of lights from 0 to {MAX_SCATTERED_LIGHTS:,}.")
+        raise InputError(
+            f"lights {n_lights}: must be a lights.csv, or a number of lights from 0 to {MAX_SCATTERED_LIGHTS:,}."
+        )
     return n_lights
 
 
@@ -228,4 +230,6 @@ def _own_setup(
         raise InputError(f"{options.cameras}: has {len(cameras)} frames for {len(files)} G-buffers; give one for each.")
     cameras = replace(cameras, poses=cameras.poses[: len(files)])
     name = files[0].stem if len(files) == 1 else files[0].parent.name
-    return SceneSetup(name, 0, cameras, options.seed, _OwnSamples(files), DEFAULT_LIGHTS if lights is None else lights, options)
+    return SceneSetup(
+        name, 0, cameras, options.seed, _OwnSamples(files), DEFAULT_LIGHTS if lights is None else lights, options
+    )

@@ -77,9 +77,7 @@ def reflected(
         along = -(to_x * light[..., 8] + to_y * light[..., 9] + to_z * light[..., 10])
         cos_cone = along / (distance + _TINY)
         lit = lit * jnp.clip((cos_cone - light[..., 12]) * light[..., 11], 0, 1)
-    return tuple(
-        lit * light[..., 4 + c] * (base + gloss) for c, base in enumerate(surface.base_colour)
-    )
+    return tuple(lit * light[..., 4 + c] * (base + gloss) for c, base in enumerate(surface.base_colour))
 
 
 _CPU_SAMPLES_AT_ONCE = 4096

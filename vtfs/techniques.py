@@ -135,14 +135,14 @@ def _all_lights(lights: ViewLights, clusters: Clusters) -> LightLists:
 
 
 _CLUSTERS = Stage("clusters", _clusters, ("positions", "grid"), ("bounds", "cells", "blocks"))
-_SHADE = Stage(
-    "shade_opaque", _shade, ("gbuffer", "lights", "light_cutoff", "clusters", "assign"), ("batch",)
-)
+_SHADE = Stage("shade_opaque", _shade, ("gbuffer", "lights", "light_cutoff", "clusters", "assign"), ("batch",))
 
 REGISTRY: dict[str, Technique] = {
     technique.name: technique
     for technique in (
-        Technique("forward", (Stage("shade_opaque", _shade_forward, ("gbuffer", "lights", "light_cutoff"), ("batch",)),)),
+        Technique(
+            "forward", (Stage("shade_opaque", _shade_forward, ("gbuffer", "lights", "light_cutoff"), ("batch",)),)
+        ),
         Technique(
             "tiled_deferred",
             (
@@ -167,4 +167,3 @@ REGISTRY: dict[str, Technique] = {
         ),
     )
 }
-

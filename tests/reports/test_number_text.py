@@ -20,7 +20,7 @@ def test_a_price_has_the_unit_that_needs_no_exponent(ms_per_op, text):
 
 
 @pytest.mark.parametrize(
-    ("error", "text"), [(None, "–"), (0.0, "exact"), (9.9e-8, "exact"), (1e-7, "1.0e-7"), (2.4e-4, "2.4e-4")]
+    ("error", "text"), [(None, "–"), (0.0, "exact"), (1.9e-5, "exact"), (2e-5, "2.0e-5"), (2.4e-4, "2.4e-4")]
 )
 def test_an_error_that_is_only_rounding_is_called_exact(error, text):
     assert number_text.error(error) == text

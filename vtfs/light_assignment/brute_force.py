@@ -10,7 +10,6 @@ from vtfs.clusters import Clusters
 from vtfs.light_lists import AssignCounts, LightLists, lists_from_pairs
 from vtfs.wide_tree import in_leaf_nodes, n_leaf_nodes
 
-
 _MAX_ROWS = 2**30  # the last chunk starts below 2^31
 
 

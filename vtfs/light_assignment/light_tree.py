@@ -31,7 +31,7 @@ class LightTree(eqx.Module):
     light: Int[Array, " lights"]
 
 
-def reduce_lights(lights: Sphere) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+def reduce_lights(lights: Sphere) -> tuple[Float[Array, 3], Float[Array, 3]]:
     """Box of all lights' centres (lights that reach nothing left out)."""
 
     def extent(centre_m):
@@ -65,9 +65,7 @@ def light_tree(lights: Sphere, branching: int) -> LightTree:
     return build_light_tree(lights, sort_lights(morton_codes(lights, low_m, high_m)), branching)
 
 
-def assign_tree(
-    lights: LightTree, clusters: Clusters, capacity: int, chunk: int
-) -> tuple[LightLists, AssignCounts]:
+def assign_tree(lights: LightTree, clusters: Clusters, capacity: int, chunk: int) -> tuple[LightLists, AssignCounts]:
     """Walk the clusters' boxes down the light tree; at the leaves the sphere decides.
 
     Lights are listed in Morton order.
@@ -85,5 +83,3 @@ def assign_tree(
     index = lights.light[jnp.minimum(found.item, last)]
     lists = lists_from_pairs(found.query, index, found.total, found.overflowed, clusters.key.shape[0])
     return lists, AssignCounts(found.node_rows, found.short_rows, found.leaf_rows, found.short_leaf_rows)
-
-
