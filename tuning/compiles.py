@@ -33,12 +33,12 @@ def watch_compiles() -> Compiles:
     """A record that counts from now on, for as long as the process lives."""
     seen = Compiles()
 
-    def on_duration(event: str, seconds: float, **_: object) -> None:
+    def on_duration(event: str, duration_secs: float, **kwargs: str | int) -> None:
         if event == _COMPILED:
             seen.events += 1
-            seen.seconds += seconds
+            seen.seconds += duration_secs
 
-    def on_event(event: str, **_: object) -> None:
+    def on_event(event: str, **kwargs: str | int) -> None:
         if event == _CACHE_HIT:
             seen.cache_hits += 1
 

@@ -9,7 +9,7 @@ from vtfs.parameters import Value
 
 FLOAT32_ERROR = 2e-5
 """Error of an image that differs from the float64 reference by rounding alone: near a light the rounding of its
-position (6e-8 of its distance to the eye) counts against its distance to the sample. 0.5e-5 to 1.1e-5 on the built-in scenes."""
+position (6e-8 of its distance to the eye) counts against its distance to the sample. In the atrium: 1.1e-5."""
 
 Outcome = Literal["timed", "overflow", "out_of_memory", "timeout", "failed"]
 

@@ -214,7 +214,8 @@ def _pictures(workload: SceneWorkload, found: SearchResult, folder: Path) -> lis
             "file": "frame.png",
             "kind": "frame",
             "technique": found.best.technique,
-            "caption": f"Frame {frame}, the one with the most lighting computations, as {found.best.technique} renders it.",
+            "caption": f"Frame {frame}, the one with the most lighting computations, "
+            f"as {found.best.technique} renders it.",
         }
     ]
     fastest: dict[str, Measurement] = {}

@@ -114,7 +114,7 @@ class SceneWorkload:
             outcome, message = "out_of_memory", str(error) or "the host's memory is full"
         except jax.errors.JaxRuntimeError as error:
             outcome = "out_of_memory" if "RESOURCE_EXHAUSTED" in str(error) else "failed"
-            message = str(error).splitlines()[0][:300]
+            message = (str(error).splitlines() or ["the device gave no reason"])[0][:300]
         if outcome != "timed":
             log.warning("%s: %s (%s)", config, outcome, message)
         return Measurement(
@@ -177,10 +177,10 @@ class SceneWorkload:
         exact = config["gbuffer"] == "float32" and config["light_cutoff"] == 0
         if exact and not taken.error <= EXACT_ERROR:
             return "failed", f"error {taken.error:.2g} against the float64 reference; float32 explains {EXACT_ERROR:g}"
-        if time.perf_counter() - started > TIMEOUT_S:
-            # Or was it the compiler?
-            if (seconds := timed_ms(self._frame_run(config, 0)) / 1e3) > TIMEOUT_S:
-                return "timeout", f"one frame took {seconds:.0f} s, more than {TIMEOUT_S:.0f} s"
+        # The first run's time may be the compiler's: only a second one is held against the configuration.
+        slow = time.perf_counter() - started > TIMEOUT_S
+        if slow and (seconds := timed_ms(self._frame_run(config, 0)) / 1e3) > TIMEOUT_S:
+            return "timeout", f"one frame took {seconds:.0f} s, more than {TIMEOUT_S:.0f} s"
 
         frames: list[tuple[float, ...]] = []
         slowest_low = 0.0

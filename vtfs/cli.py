@@ -27,7 +27,8 @@ SceneArgument = Annotated[
     str | None,
     typer.Argument(
         metavar="[SCENE]",
-        help="GLB, glTF, OBJ, PLY or STL file; a G-buffer .npz (or a folder of them); or a built-in scene. Default: atrium.",
+        help="GLB, glTF, OBJ, PLY or STL file; a G-buffer .npz (or a folder of them); or a built-in scene. "
+        "Default: atrium.",
     ),
 ]
 CamerasOption = Annotated[Path | None, typer.Option(help="Camera path: cameras.json.", metavar="FILE")]
@@ -38,9 +39,10 @@ LightsOption = Annotated[
     ),
 ]
 SizeOption = Annotated[str | None, typer.Option(help="Image size, as 1280x720.", metavar="WxH")]
-SeedOption = Annotated[int, typer.Option(help="Of everything that is random.")]
+SeedOption = Annotated[int, typer.Option(min=0, help="Of everything that is random.")]
 PerSampleOption = Annotated[
-    int, typer.Option(help="Scattered lights get the range at which so many reach a visible sample in the median.")
+    int,
+    typer.Option(min=1, help="Scattered lights get the range at which so many reach a visible sample in the median."),
 ]
 DensityOption = Annotated[
     str, typer.Option(help="Where lights are scattered: `constant`: in the scene's box; `fixed`: one a cubic metre.")
@@ -56,7 +58,7 @@ JsonOption = Annotated[
 VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Say more of what is done, on stderr.")]
 
 
-_UsageError = typer.BadParameter.__mro__[1]
+_UsageError: Any = typer.BadParameter.__mro__[1]
 """Click's, or that of typer where it brings its own copy of Click."""
 
 _INTERRUPTED = 130
@@ -366,8 +368,6 @@ def _setup(
 ):
     if density not in ("constant", "fixed"):
         raise InputError(f"--density {density}: must be constant or fixed.")
-    if seed < 0:
-        raise InputError(f"--seed {seed}: must be 0 or more.")
     viewport = _viewport(size)
     from vtfs.scene_setup import SceneOptions, set_up
 

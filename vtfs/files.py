@@ -24,8 +24,8 @@ def write_atomically(path: Path | str, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         # mkstemp makes files for the owner alone; these are for the user's colleagues too.
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
+        Path(temporary).chmod(0o666 & ~_umask())
+        Path(temporary).replace(path)
         temporary = None
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another folder.") from error

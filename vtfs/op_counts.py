@@ -116,7 +116,7 @@ def assign_counts(counts: AssignCounts, n_lights: int, branching: int) -> OpCoun
     return {
         "tree_tests": n_child_tests(counts.node_rows, counts.short_rows, below, branching),
         "leaf_tests": n_child_tests(
-            np.asarray(counts.leaf_rows)[None], np.asarray(counts.short_leaf_rows)[None], (n_lights,), branching
+            np.atleast_1d(counts.leaf_rows), np.atleast_1d(counts.short_leaf_rows), (n_lights,), branching
         ),
         "tree_nodes": sum(levels) + n_leaves,
     }

@@ -74,7 +74,8 @@ PARAMETERS: dict[str, Parameter] = {
         Parameter(
             "batch",
             0,
-            "queries in one chunk: clusters when assigning, samples when shading; 0: all at once (on a CPU: what fits its cache)",
+            "queries in one chunk: clusters when assigning, samples when shading; "
+            "0: all at once (on a CPU: what fits its cache)",
             choices=_BATCHES,
         ),
         Parameter("bounds", "implicit", "what stands for the samples of a cell", choices=("implicit", "explicit")),

@@ -23,7 +23,7 @@ from vtfs.light_assignment.light_tree import (
     reduce_lights,
     sort_lights,
 )
-from vtfs.light_lists import LightLists, ViewLights
+from vtfs.light_lists import AssignCounts, LightLists, ViewLights
 from vtfs.morton import morton_codes
 from vtfs.parameters import Configuration
 from vtfs.shading import Image, shade
@@ -85,6 +85,9 @@ class Technique:
         )
 
 
+Assigned = tuple[LightLists, AssignCounts]
+
+
 def _clusters(plan: Plan, positions: Positions, grid: ClusterGrid) -> Clusters:
     return form_clusters(positions, grid, plan.bounds, plan.cells, plan.blocks)
 
@@ -94,12 +97,12 @@ def walk_chunk(batch: int, branching: int, pairs: int) -> int:
     return batch or min(pairs, _TESTS_AT_ONCE.get(jax.default_backend(), 2**22) // branching)
 
 
-def _assign_brute_force(plan: Plan, lights: ViewLights, light_cutoff, clusters: Clusters) -> LightLists:
+def _assign_brute_force(plan: Plan, lights: ViewLights, light_cutoff, clusters: Clusters) -> Assigned:
     chunk = walk_chunk(plan.batch, 32, plan.pairs)
     return assign_brute_force(lights.spheres(light_cutoff), clusters, plan.pairs, chunk)
 
 
-def _assign_tree(plan: Plan, tree: LightTree, clusters: Clusters) -> LightLists:
+def _assign_tree(plan: Plan, tree: LightTree, clusters: Clusters) -> Assigned:
     return assign_tree(tree, clusters, plan.pairs, walk_chunk(plan.batch, plan.branching, plan.pairs))
 
 

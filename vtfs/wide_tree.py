@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from vtfs.bit_lists import gather_hits
 from vtfs.bounds import Aabb
@@ -169,9 +170,7 @@ def walk(
     )
 
 
-def n_child_tests(
-    node_rows: Int[Array, " levels"], short_rows: Int[Array, " levels"], n_children: tuple[int, ...], branching: int
-) -> int:
+def n_child_tests(node_rows: ArrayLike, short_rows: ArrayLike, n_children: tuple[int, ...], branching: int) -> int:
     """Tests of existing children: a whole node's for each visit, less what the level's last node lacks."""
     rows, short = np.asarray(node_rows, np.int64), np.asarray(short_rows, np.int64)
     missing = np.array([-count % branching for count in n_children], np.int64)

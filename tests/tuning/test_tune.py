@@ -30,6 +30,7 @@ SPACE = "[parameters]\ntile_px = [16, 32]\n"
 def _quick(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("space.toml").write_text(SPACE)
+    Path("forward.toml").write_text("[parameters]\nbatch = [0]\n")
     with short_repeats():
         yield
 
@@ -79,11 +80,11 @@ def is_complete(result, out="out"):
 
 
 def test_a_built_in_scene_with_the_default_space():
-    ran = vtfs("tune", *SMALL, "--budget", "5", "--out", "new/out")
+    ran = vtfs("tune", *SMALL, "--budget", "3", "--out", "new/out")
     result = result_of(ran, "new/out")
     is_complete(result, "new/out")
     assert result["scene"]["name"] == "street" and result["scene"]["lights"] == 20 and result["scene"]["frames"] == 60
-    assert result["measured"] + result["failed"] == 5 and result["seed"] == 0
+    assert result["measured"] + result["failed"] == 3 < result["space_size"] and result["seed"] == 0
     assert {m.technique for m in read_measurements("new/out/measurements.jsonl")} == TECHNIQUES
     assert "new/out/report.html" in ran.out and result["best"]["technique"] in ran.out.splitlines()[0]
     assert "for this JAX implementation on this device" in ran.out
@@ -125,7 +126,7 @@ def test_json_on_stdout_is_all_that_is_printed():
 
 
 def test_a_named_technique_is_the_only_one_measured():
-    result = result_of(tune("--techniques", "forward", "--budget", "4"))
+    result = result_of(tune("--techniques", "forward", "--budget", "4", space="forward.toml"))
     assert result["best"]["technique"] == "forward"
     assert {technique for technique, _ in configurations_of()} == {"forward"}
 
@@ -140,7 +141,7 @@ def test_the_mean_of_the_frames_is_an_objective():
 
 @pytest.mark.parametrize("max_error", ["0.5", "1e-5"])
 def test_a_larger_error_allows_what_changes_the_image(max_error):
-    result = result_of(tune("--techniques", "forward", "--budget", "20", "--max-error", max_error))
+    result = result_of(tune("--techniques", "forward", "--budget", "20", "--max-error", max_error, space="forward.toml"))
     allowed = [m for m in read_measurements("out/measurements.jsonl") if m.error is not None and m.error <= float(max_error)]
     fastest = min(allowed, key=lambda m: max(np.median(frame) for frame in m.stages_ms["frame"] if frame))
     assert (result["best"]["technique"], result["best"]["params"]) == (fastest.technique, fastest.params)
@@ -313,7 +314,7 @@ def test_a_stage_that_fails_by_itself_is_a_line(monkeypatch):
 
 def test_where_all_fail_that_is_said_in_one_line(monkeypatch):
     broken_frames(monkeypatch, "forward", raising(MemoryError()))
-    is_refused(tune("--budget", "2", "--techniques", "forward"), "configurations", "out_of_memory", "smaller size")
+    is_refused(tune("--budget", "2", "--techniques", "forward", space="forward.toml"), "configurations", "out_of_memory", "smaller size")
     assert len(lines_of()) == 2
 
 
@@ -326,7 +327,7 @@ def test_a_half_precision_image_may_be_infinite(monkeypatch):
         return (tuple(np.inf * channel for channel in image) if config["gbuffer"] == "float16" else image), overflowed
 
     monkeypatch.setattr(tuning.workload.SceneWorkload, "_run_frame", overflowing)
-    result = result_of(tune("--techniques", "forward", "--budget", "20"))
+    result = result_of(tune("--techniques", "forward", "--budget", "20", space="forward.toml"))
     is_complete(result)
     assert all(point["params"]["gbuffer"] != "float16" for point in result["pareto"])
 

@@ -163,7 +163,7 @@ def test_a_camera_that_sees_nothing(technique):
 
 
 def test_one_pixel_and_one_light():
-    ran = vtfs("render", "street", "--triangles", "1000", "--size", "1x1", "--lights", "1", "--json", "-")
+    ran = vtfs("render", "street", "--triangles", "1000", "--size", "1x1", "--lights", "1", "--technique", "forward", "--json", "-")
     assert ran.code == 0 and ran.err == ""
     with Image.open(ran.json["pictures"][0]["image"]) as picture:
         assert picture.size == (1, 1)

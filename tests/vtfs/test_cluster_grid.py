@@ -70,7 +70,10 @@ def test_a_cubic_cell_is_as_deep_as_it_is_high():
 @pytest.mark.parametrize("n_slices", [0, 24])
 def test_an_infinite_far_plane_ends_at_the_deepest_sample(n_slices):
     camera = a_camera(near_m=0.1, far_m=math.inf)
-    grid, finite = cluster_grid(camera, 8, n_slices, 50.0), cluster_grid(a_camera(near_m=0.1, far_m=50.0), 8, n_slices, 0.0)
+    grid, finite = (
+        cluster_grid(camera, 8, n_slices, 50.0),
+        cluster_grid(a_camera(near_m=0.1, far_m=50.0), 8, n_slices, 0.0),
+    )
     assert [float(a) for a in jax.tree.leaves(grid)] == [float(a) for a in jax.tree.leaves(finite)]
     assert int(cluster_grid(camera, 8, n_slices, 0.1).depth_slices) >= 1  # no sample beyond the near plane
 
@@ -95,7 +98,9 @@ def test_keys_name_tiles_and_slices_and_boxes_hold_their_samples(viewport, camer
     assert (key // (columns * rows) == slices_jit(grid, depth_m)).all() and ((key >= 0) & (key < total)).all()
     box = boxes_jit(grid, viewport, jnp.asarray(key.ravel()))
     position_m = samples.position_m.reshape(-1, 3)
-    for c, (low, high) in enumerate(((box.low_x_m, box.high_x_m), (box.low_y_m, box.high_y_m), (box.low_z_m, box.high_z_m))):
+    for c, (low, high) in enumerate(
+        ((box.low_x_m, box.high_x_m), (box.low_y_m, box.high_y_m), (box.low_z_m, box.high_z_m))
+    ):
         assert ((low <= position_m[:, c]) & (position_m[:, c] <= high)).all()
 
 
@@ -111,8 +116,14 @@ def test_boxes_are_no_larger_than_their_cells_with_slack(camera, tile_px):
     growth = (far_m / camera.near_m) ** (1 / n_slices)
     for n, (i, j, k) in enumerate(zip(key % columns, key // columns % rows, key // (columns * rows), strict=True)):
         depths = camera.near_m * growth ** float(k), camera.near_m * growth ** float(k + 1)
-        edges_x = [(2 * min(px, SMALL.width_px) / SMALL.width_px - 1) * camera.tan_half_x for px in (i * tile_px, (i + 1) * tile_px)]
-        edges_y = [(1 - 2 * min(px, SMALL.height_px) / SMALL.height_px) * camera.tan_half_y for px in (j * tile_px, (j + 1) * tile_px)]
+        edges_x = [
+            (2 * min(px, SMALL.width_px) / SMALL.width_px - 1) * camera.tan_half_x
+            for px in (i * tile_px, (i + 1) * tile_px)
+        ]
+        edges_y = [
+            (1 - 2 * min(px, SMALL.height_px) / SMALL.height_px) * camera.tan_half_y
+            for px in (j * tile_px, (j + 1) * tile_px)
+        ]
         corners = np.array([(x * d, y * d, -d) for x in edges_x for y in edges_y for d in depths])
         slack = 5e-5 * depths[1] * (1 + camera.tan_half_x)
         low, high = sides[:3, n], sides[3:, n]
@@ -122,5 +133,7 @@ def test_boxes_are_no_larger_than_their_cells_with_slack(camera, tile_px):
 
 def test_more_cells_than_keys_are_refused_with_what_to_change():
     camera = a_camera(Viewport(1920, 1080), 1e-3, 1e5, 10.0)
-    with pytest.raises(InputError, match=r"tile_px=2 with depth_slices=0 makes [\d,]+ cells.*larger tiles or fewer slices"):
+    with pytest.raises(
+        InputError, match=r"tile_px=2 with depth_slices=0 makes [\d,]+ cells.*larger tiles or fewer slices"
+    ):
         cluster_grid(camera, 2, 0, 0.0)

@@ -44,7 +44,9 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch, step, existed)
     if existed:
         path.write_bytes(b"old")
     monkeypatch.setattr(files.os, step, full)
-    with pytest.raises(InputError, match=r"result\.json: cannot be written \(No space left on device\); choose another"):
+    with pytest.raises(
+        InputError, match=r"result\.json: cannot be written \(No space left on device\); choose another"
+    ):
         write_atomically(path, b"new")
     assert names(tmp_path) == (["result.json"] if existed else [])
     assert not existed or path.read_bytes() == b"old"

@@ -53,8 +53,12 @@ def test_each_cluster_is_lit_by_its_own_list_only(batch, seed):
         clusters.key, clusters.box, jnp.int32(n_runs), jnp.asarray(run), jnp.arange(capacity), jnp.int32(n_runs),
         jnp.asarray(of_sample.astype(np.int32)), jnp.bool_(False),
     )  # fmt: skip
-    device = LightLists(jnp.asarray(offset), jnp.asarray(filled), jnp.asarray(index), jnp.int32(len(index)), jnp.bool_(False))
-    image = on_host(shade_jit(gbuffer, clusters, device, view_lights(lights, samples.camera).row, np.float32(0), batch), SMALL)
+    device = LightLists(
+        jnp.asarray(offset), jnp.asarray(filled), jnp.asarray(index), jnp.int32(len(index)), jnp.bool_(False)
+    )
+    image = on_host(
+        shade_jit(gbuffer, clusters, device, view_lights(lights, samples.camera).row, np.float32(0), batch), SMALL
+    )
     listed = np.zeros((n_runs, 37), bool)
     for block, some in enumerate(lists):
         listed[run[block], some] = True
@@ -78,10 +82,15 @@ def test_very_long_lists_lose_no_light(batch):
     index = np.zeros(lengths.sum(), np.int32)
     index[np.cumsum(lengths) - 1] = 1
     offset = jnp.array([0, lengths[0]], jnp.int32)
-    lists = LightLists(offset, jnp.asarray(lengths, jnp.int32), jnp.asarray(index), jnp.int32(len(index)), jnp.bool_(False))
+    lists = LightLists(
+        offset, jnp.asarray(lengths, jnp.int32), jnp.asarray(index), jnp.int32(len(index)), jnp.bool_(False)
+    )
     lights = nearby_lights(samples, 2, 0)
     lights.range_m[:], lights.colour[0] = 1e3, 0
-    image = on_host(shade_jit(gbuffer, clusters, lists, view_lights(lights, samples.camera).row, np.float32(0), batch), Viewport(16, 4))
+    image = on_host(
+        shade_jit(gbuffer, clusters, lists, view_lights(lights, samples.camera).row, np.float32(0), batch),
+        Viewport(16, 4),
+    )
     assert largest_relative_difference(image, oracles.image(samples, lights), samples.valid) < 1e-4
 
 

@@ -51,7 +51,14 @@ def test_the_boxes_of_children_are_those_of_all_items_below(n_items, branching):
 
 @pytest.mark.parametrize(
     ("n_items", "branching", "levels"),
-    [(1, 32, ()), (32, 32, ()), (33, 32, (1,)), (1024, 32, (1,)), (1025, 32, (1, 2)), (5_000_000, 32, (1, 5, 153, 4883))],
+    [
+        (1, 32, ()),
+        (32, 32, ()),
+        (33, 32, (1,)),
+        (1024, 32, (1,)),
+        (1025, 32, (1, 2)),
+        (5_000_000, 32, (1, 5, 153, 4883)),
+    ],
 )
 def test_levels_have_as_few_nodes_as_hold_the_items(n_items, branching, levels):
     assert inner_level_nodes(n_items, branching) == levels
@@ -84,9 +91,7 @@ walk_jit = jax.jit(walk_boxes, static_argnums=(5, 6, 7))
 
 def slow_walk(low, high, query_low, query_high, kept, branching):
     def descend(query, items):
-        return bool(
-            (query_low[query] <= high[items].max(0)).all() and (low[items].min(0) <= query_high[query]).all()
-        )
+        return bool((query_low[query] <= high[items].max(0)).all() and (low[items].min(0) <= query_high[query]).all())
 
     return oracles.walk(len(low), branching, len(query_low), descend, lambda query, item: bool(kept[query, item]))
 
