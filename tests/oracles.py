@@ -77,7 +77,7 @@ def near_cutoff(samples: ViewSamples, lights: Lights, light_cutoff: float, slack
     """Pixels where a window is so near to the cut-off that rounding decides, bool `[h, w]`."""
     if not light_cutoff:
         return np.zeros(samples.valid.shape, bool)
-    return (np.abs(windows(samples, lights) - light_cutoff) < slack).any(axis=-1)
+    return np.any(np.abs(windows(samples, lights) - light_cutoff) < slack, axis=-1)
 
 
 def run_pixels(viewport: Viewport) -> np.ndarray:
@@ -115,7 +115,9 @@ def cells(samples: ViewSamples, tile_px: int, slices: np.ndarray) -> dict[tuple[
     return found
 
 
-def spheres_in_boxes(centre_m: np.ndarray, radius_m: np.ndarray, low: np.ndarray, high: np.ndarray, share: float = 1):
+def spheres_in_boxes(
+    centre_m: np.ndarray, radius_m: np.ndarray, low: np.ndarray, high: np.ndarray, share: float = 1
+) -> np.ndarray:
     """Do spheres, with `share` of their radius, touch boxes? bool `[boxes, spheres]` from `[N, 3]` and `[B, 3]`."""
     outside = np.maximum(np.maximum(low[:, None] - centre_m, centre_m - high[:, None]), 0)
     with np.errstate(invalid="ignore"):
@@ -142,7 +144,9 @@ def walk(
     levels = [[[item] for item in range(n_items)]]
     while len(levels[-1]) > 1 or len(levels) == 1:
         below = levels[-1]
-        levels.append([sum(below[k : k + branching], []) for k in range(0, len(below), branching)])
+        levels.append(
+            [[item for child in below[k : k + branching] for item in child] for k in range(0, len(below), branching)]
+        )
     result = SlowWalk([])
 
     def visit(query: int, level: int, node: int) -> None:

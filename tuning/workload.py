@@ -90,9 +90,8 @@ class SceneWorkload:
         return (self.counts_of_frame(config, 0),)
 
     def counts_of_frame(self, config: Configuration, i: int) -> OpCounts:
-        # Counting is done once for all values of what does not change a list. Except for the cut-off's last
-        # bits, counts do not depend on the G-buffer's precision either.
-        canonical = config.replaced(batch=0, gbuffer="float32")
+        # Counting is done once for all batches: they change no list.
+        canonical = config.replaced(batch=0)
         if (canonical, i) not in self._counted:
             self._counted[canonical, i] = cached_counts(
                 canonical, self.scene_key, self.frames[i], lambda: self._inputs[i]
@@ -173,7 +172,8 @@ class SceneWorkload:
         if bool(overflowed):
             return "overflow", "a frame no longer fits the capacities that its sizing run found"
         valid = self._path.samples[0].valid
-        taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), self.reference(), valid)
+        with np.errstate(invalid="ignore", over="ignore"):  # of an image that overflowed the error is infinite
+            taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), self.reference(), valid)
         exact = config["gbuffer"] == "float32" and config["light_cutoff"] == 0
         if exact and not taken.error <= EXACT_ERROR:
             return "failed", f"error {taken.error:.2g} against the float64 reference; float32 explains {EXACT_ERROR:g}"
@@ -232,7 +232,7 @@ class SceneWorkload:
             return NO_SIZES
         for i in range(len(self._inputs)):
             self.counts_of_frame(config, i)
-        canonical = config.replaced(batch=0, gbuffer="float32")
+        canonical = config.replaced(batch=0)
         sizes = NO_SIZES
         for i in range(len(self._inputs)):
             sizes = sizes.covering(self._counted[canonical, i].sizes)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate, stats
 
-from tests.tuning.test_sweep import SHADING_BOUND, SMALL, WHOLE, Synthetic, erratic
+from tests.tuning.test_sweep import LARGE, SHADING_BOUND, SMALL, WHOLE, Synthetic, erratic
 from tuning.choose import (
     choose_next,
     initial_design,
@@ -19,7 +19,7 @@ from tuning.choose import (
     work_done,
 )
 from tuning.cost_model import CostModel
-from tuning.measurement import Measurement, Outcome
+from tuning.measurement import FLOAT32_ERROR, Measurement, Outcome
 from tuning.select import fit_stage
 from tuning.space import Space
 from vtfs.parameters import configuration
@@ -80,12 +80,43 @@ def test_the_interval_holds_the_median(repeats):
     [
         measurement((1.0,), outcome="timeout"),
         measurement((1.0,), (math.nan,)),
-        measurement((1.0,), ()),
+        measurement((1.0,), (), (math.inf,)),
+        measurement((), (1.0,)),
+        measurement((), ()),
         measurement(),
     ],
 )
 def test_what_has_no_sound_time_is_not_timed(m):
     assert not is_timed(m)
+
+
+@pytest.mark.parametrize("objective", ["max", "mean"])
+def test_the_first_frame_alone_is_a_time(objective):
+    m = measurement((5.0, 7.0, 6.0), (), ())
+    assert is_timed(m)
+    assert time_ms(m, objective) == 6.0
+    assert time_interval_ms(m, objective) == (5.0, 7.0)
+
+
+def test_frames_without_times_count_in_neither_the_maximum_nor_the_mean():
+    m = measurement((2.0, 4.0), (), (8.0, 10.0))
+    assert is_timed(m)
+    assert time_ms(m, "max") == 9.0
+    assert time_interval_ms(m, "max") == (8.0, 10.0)
+    assert time_ms(m, "mean") == pytest.approx((3 + 9) / 2)
+    assert time_interval_ms(m, "mean") == pytest.approx(((2 + 8) / 2, (4 + 10) / 2))
+
+
+def test_errors_of_rounding_alone_are_equal_on_the_front():
+    fast = measurement((1.0,), error=0.9 * FLOAT32_ERROR)
+    slow = measurement((2.0,), error=0.1 * FLOAT32_ERROR)
+    assert pareto_front([slow, fast], "max") == (fast,)
+    assert pareto_front([slow, measurement((1.0,), error=FLOAT32_ERROR)], "max")[-1].error == FLOAT32_ERROR
+    # What is more than rounding is beaten by what is rounding, and what beats it is still told by its own error.
+    approximate = measurement((1.0,), error=1.1 * FLOAT32_ERROR)
+    assert pareto_front([slow, approximate], "max") == (approximate, slow)
+    coarse = measurement((0.5,), error=0.01)
+    assert pareto_front([fast, slow, coarse], "max") == (coarse, fast)
 
 
 @given(st.lists(st.tuples(st.integers(1, 9), st.none() | st.integers(0, 9)), max_size=12))
@@ -106,6 +137,22 @@ def test_the_design_starts_with_the_defaults_and_spreads_over_the_values(seed):
     assert len(design) == len(set(design))
     assert all(candidate in WHOLE for candidate in design)
     per_technique = Counter(candidate.technique for candidate in design)
+    # The default and three more, one of which may turn out to be the default.
+    assert set(per_technique) == set(WHOLE.techniques)
+    assert 3 <= min(per_technique.values()) <= max(per_technique.values()) == 4
+    tried = [c for c in design if c.technique == "volume_tiled_bvh"]
+    # Latin: three points in three strata; every batch and both values of branching, and two of four values at least.
+    for name, n_least in {"batch": 3, "branching": 2, "tile_px": 2, "depth_slices": 2}.items():
+        assert len({c[name] for c in tried}) >= n_least
+    assert design == initial_design(WHOLE, workload.counts, seed)
+    assert design != initial_design(WHOLE, workload.counts, seed + 1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_larger_design_spreads_over_a_larger_space(seed):
+    workload = Synthetic(SHADING_BOUND)
+    design = initial_design(LARGE, workload.counts, seed, per_technique=5)
+    per_technique = Counter(candidate.technique for candidate in design)
     assert 4 <= min(per_technique.values()) <= max(per_technique.values()) <= 6
     spread = [c for c in design[3:] if c.technique == "volume_tiled_bvh"]
     # Latin: five points in five strata; four values of branching, five of tile size and batch.
@@ -113,8 +160,7 @@ def test_the_design_starts_with_the_defaults_and_spreads_over_the_values(seed):
     assert len({c["batch"] for c in spread}) >= 4
     assert len({c["depth_slices"] for c in spread}) >= 3
     assert len({c["branching"] for c in spread}) >= 3
-    assert design == initial_design(WHOLE, workload.counts, seed)
-    assert design != initial_design(WHOLE, workload.counts, seed + 1)
+    assert design == initial_design(LARGE, workload.counts, seed, per_technique=5)
 
 
 def test_the_design_of_a_small_space_is_all_of_it():

@@ -201,6 +201,13 @@ def test_what_has_a_default_may_be_missing(tmp_path):
     assert [m.seed for m in read_measurements(path)] == [0, 4]
 
 
+def test_a_configuration_that_was_timed_on_the_first_frame_alone_is_read_back(tmp_path):
+    path = tmp_path / "measurements.jsonl"
+    lost = replace(ONE, stages_ms={"frame": ((1.0, 2.0), ())})
+    append_measurement(path, lost)
+    assert read_measurements(path) == [lost]
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
@@ -221,6 +228,10 @@ def test_what_has_a_default_may_be_missing(tmp_path):
         (_line(stages_ms=[]), "`stages_ms`: .* is not an object"),
         (_line(stages_ms={}), "`stages_ms.frame` and `counts` need an entry"),
         (_line(stages_ms={"frame": [[]]}), "`stages_ms.frame` and `counts` need an entry"),
+        (
+            _line(frames=[0, 1], stages_ms={"frame": [[], [1.0]]}, counts=[{"samples": 1}] * 2),
+            "`stages_ms.frame` and `counts` need an entry for each of `frames`, and times for the first",
+        ),
         (_line(counts=[]), "`stages_ms.frame` and `counts` need an entry"),
         (_line(counts=[{"samples": 1.5}]), "`counts`: 1.5 is not a whole number"),
         (_line(params={"tile_px": [1]}), r"`params`: \[1\] is not a number"),

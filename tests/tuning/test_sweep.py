@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tuning.choose import choose_next
+from tuning.choose import choose_next, initial_design
 from tuning.measurement import Measurement, Outcome
 from tuning.record import read_measurements
 from tuning.space import Space, default_space
@@ -85,7 +85,7 @@ class Synthetic:
     def true_ms(self, configuration: Configuration) -> list[float]:
         """Noiseless time of each frame."""
         faster = 0.8 if configuration["gbuffer"] != "float32" else 1.0
-        faster *= 1 - 2 * float(configuration["light_cutoff"])
+        faster *= 1 - 3 * float(configuration["light_cutoff"])
         costs = [5 + sum(self.law[n] * c for n, c in f.items() if n in self.law) for f in self.counts(configuration)]
         return [ms * faster * self.hidden(configuration) for ms in costs]
 
@@ -123,6 +123,19 @@ class Synthetic:
 
 
 WHOLE = default_space(["forward", "tiled_deferred", "volume_tiled_bvh"], n_samples=1280 * 720)
+LARGE = Space(
+    WHOLE.techniques,
+    {
+        "forward": {"batch": (0, 4096, 16384, 65536, 262144)},
+        "tiled_deferred": {"tile_px": (8, 16, 32, 64, 128), "batch": (0, 4096, 16384, 65536, 262144)},
+        "volume_tiled_bvh": {
+            "tile_px": (8, 16, 32, 64, 128),
+            "depth_slices": (0, 4, 8, 16, 32, 64, 128),
+            "branching": (4, 8, 16, 32),
+            "batch": (0, 4096, 16384, 65536, 262144),
+        },
+    },
+)
 SMALL = Space(
     ("tiled_deferred", "volume_tiled_bvh"),
     {
@@ -144,7 +157,7 @@ def of(measurement: Measurement) -> Configuration:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("law", [SHADING_BOUND, ASSIGNMENT_BOUND, LAUNCH_BOUND], ids=["shading", "assign", "launch"])
-def test_the_best_of_hundreds_is_found_within_5_percent_in_few_measurements(tmp_path, law, seed):
+def test_the_best_of_a_hundred_is_found_within_5_percent_in_few_measurements(tmp_path, law, seed):
     workload = Synthetic(law, seed=seed)
     result = search(WHOLE, workload, tmp_path / "measurements.jsonl", Budget(measurements=30), seed=seed)
     assert max(workload.true_ms(of(result.best))) <= 1.05 * workload.least_ms(WHOLE)
@@ -167,7 +180,15 @@ def test_it_stops_where_nothing_is_left_to_gain(tmp_path):
     result = search(WHOLE, workload, tmp_path / "measurements.jsonl", Budget(measurements=100))
     assert "is within the noise" in result.stop_reason
     assert len(workload.measured) < 30
-    assert result.models["volume_tiled_bvh"]["frame"].terms == ()
+    # The truth is 5 ms, whatever is chosen. Four configurations can show a trend by chance (a model of them may have
+    # a term), but none that promises anything, and a constant is already right within the noise.
+    model = result.models["volume_tiled_bvh"]["frame"]
+    assert model.loo_error <= model.constant_loo_error < 0.005
+    predictions = [p for p in result.predictions if p.configuration.technique == "volume_tiled_bvh"]
+    assert len(predictions) == sum(c.technique == "volume_tiled_bvh" for c in WHOLE.configurations())
+    assert min(p.predicted_ms for p in predictions) > 0.99 * 5
+    known = [p.predicted_ms for p in predictions if p.measured_ms is not None]
+    assert known == pytest.approx([5.0] * len(known), rel=0.01)
 
 
 def test_a_space_can_be_exhausted(tmp_path):
@@ -217,21 +238,29 @@ def test_the_objective_decides_what_is_best(tmp_path, objective):
 # Kill and resume
 
 
+N_SEARCHED = 16
+
+
+def sought() -> Synthetic:
+    """No model is ever sure of it: the budget is used up, and most of it on what models chose."""
+    return Synthetic(LAUNCH_BOUND, hidden=erratic)
+
+
 def searched(path: Path, workload: Workload):
-    return search(WHOLE, workload, path, Budget(measurements=16))
+    return search(WHOLE, workload, path, Budget(measurements=N_SEARCHED))
 
 
 @pytest.mark.parametrize("torn", [b"", b'{"schema": 1, "technique": "tiled_def'])
 def test_a_kill_after_any_line_neither_loses_nor_repeats_a_measurement(tmp_path, torn):
     whole = tmp_path / "whole.jsonl"
-    complete = Synthetic(LAUNCH_BOUND)
+    complete = sought()
     expected = searched(whole, complete)
     lines = whole.read_bytes().splitlines(keepends=True)
-    assert len(lines) == 16
-    for n_kept in range(0, 17, 3):
+    assert len(lines) == N_SEARCHED
+    for n_kept in range(0, N_SEARCHED + 1, 4):
         path = tmp_path / f"{n_kept}.jsonl"
         path.write_bytes(b"".join(lines[:n_kept]) + torn)
-        workload = Synthetic(LAUNCH_BOUND)
+        workload = sought()
         result = searched(path, workload)
         assert path.read_bytes().splitlines(keepends=True)[:n_kept] == lines[:n_kept]
         # It goes on as if nothing had happened.
@@ -243,18 +272,18 @@ def test_a_kill_after_any_line_neither_loses_nor_repeats_a_measurement(tmp_path,
 def test_a_kill_while_measuring_loses_that_measurement_alone(tmp_path):
     path = tmp_path / "measurements.jsonl"
     with pytest.raises(KeyboardInterrupt):
-        searched(path, Synthetic(LAUNCH_BOUND, dies_at=7))
+        searched(path, dataclasses.replace(sought(), dies_at=7))
     assert len(read_measurements(path)) == 7
-    workload = Synthetic(LAUNCH_BOUND)
+    workload = sought()
     searched(path, workload)
-    assert len(workload.measured) == 9
-    assert len(read_measurements(path)) == 16
+    assert len(workload.measured) == N_SEARCHED - 7
+    assert len(read_measurements(path)) == N_SEARCHED
 
 
 def test_a_finished_search_is_only_evaluated_again(tmp_path):
     path = tmp_path / "measurements.jsonl"
-    first = searched(path, Synthetic(LAUNCH_BOUND))
-    workload = Synthetic(LAUNCH_BOUND)
+    first = searched(path, sought())
+    workload = sought()
     assert searched(path, workload) == first
     assert workload.measured == []
 
@@ -262,11 +291,11 @@ def test_a_finished_search_is_only_evaluated_again(tmp_path):
 @pytest.mark.parametrize("other", [{"scene_key": "another"}, {"device": "another"}, {"frames": (1, 2, 3)}])
 def test_measurements_of_something_else_are_kept_but_not_used(tmp_path, other):
     path = tmp_path / "measurements.jsonl"
-    searched(path, Synthetic(LAUNCH_BOUND, **other))
-    workload = Synthetic(LAUNCH_BOUND)
+    searched(path, dataclasses.replace(sought(), **other))
+    workload = sought()
     result = searched(path, workload)
-    assert len(workload.measured) == len(result.measurements) == 16
-    assert len(read_measurements(path)) == 32
+    assert len(workload.measured) == len(result.measurements) == N_SEARCHED
+    assert len(read_measurements(path)) == 2 * N_SEARCHED
 
 
 def test_a_damaged_record_is_refused_before_anything_is_measured(tmp_path):
@@ -306,9 +335,40 @@ def test_a_default_that_fails_does_not_end_the_search(tmp_path):
 
 def test_where_everything_fails_one_line_says_so(tmp_path):
     path = tmp_path / "measurements.jsonl"
-    with pytest.raises(InputError, match=r"none of 8 configurations .*out_of_memory: 9 GB needed.*smaller size"):
-        search(SMALL, Synthetic({}, fails=lambda _: True), path, Budget(measurements=10))
-    assert len(read_measurements(path)) == 8
+    workload = Synthetic({}, fails=lambda _: True)
+    # The whole design is tried, and nothing after it: there is no time to go by.
+    design = initial_design(SMALL, workload.counts)
+    message = rf"none of {len(design)} configurations .*out_of_memory: 9 GB needed.*smaller size"
+    with pytest.raises(InputError, match=message):
+        search(SMALL, workload, path, Budget(measurements=len(design) + 2))
+    assert set(workload.measured) == set(design)
+    assert len(read_measurements(path)) == len(design)
+
+
+def test_a_configuration_that_lost_on_the_first_frame_is_not_timed_on_the_others_and_still_counts(tmp_path):
+    class Impatient(Synthetic):
+        def measure(self, configuration, best_ms, /):
+            whole = super().measure(configuration, best_ms)
+            first_ms = whole.stages_ms["frame"][0]
+            if best_ms is None or min(first_ms) <= 1.2 * best_ms:
+                return whole
+            return dataclasses.replace(whole, stages_ms={"frame": (first_ms, (), ())})
+
+    path = tmp_path / "measurements.jsonl"
+    workload = Impatient(SHADING_BOUND)
+    result = search(WHOLE, workload, path, Budget(measurements=30))
+    lost = [m for m in read_measurements(path) if not m.stages_ms["frame"][1]]
+    assert lost
+    assert max(workload.true_ms(of(result.best))) <= 1.05 * workload.least_ms(WHOLE)
+    assert result.best not in lost
+    # Their first frame is fitted, and is their measured time in the chart of predictions.
+    fitted = [m for m in result.measurements if m.technique == "volume_tiled_bvh" and of(m) in WHOLE]
+    n_rows = sum(len(repeats) > 0 for m in fitted for repeats in m.stages_ms["frame"])
+    assert result.models["volume_tiled_bvh"]["frame"].n == n_rows
+    told = {p.configuration: p.measured_ms for p in result.predictions}
+    shown = [m for m in lost if of(m) in told]
+    assert shown
+    assert all(told[of(m)] == np.median(m.stages_ms["frame"][0]) for m in shown)
 
 
 @pytest.mark.parametrize("broken_ms", [math.nan, math.inf])
@@ -409,11 +469,14 @@ def test_without_a_permitted_error_only_exact_settings_are_best(tmp_path):
     assert min(fastest.stages_ms["frame"][0]) < min(result.best.stages_ms["frame"][0])
 
 
-@pytest.mark.parametrize(("max_error", "expected"), [(0.2, 0.02), (0.015, 0.01), (1e-3, 0.0)])
+@pytest.mark.parametrize(("max_error", "expected"), [(0.2, 0.1), (0.05, 0.01), (1e-3, 0.0)])
 def test_a_permitted_error_is_used_and_kept(tmp_path, max_error, expected):
+    # A cut-off of 0.1 saves 30 %, half precision 20 % and a cut-off of 0.01 3 %; they are not combined.
     workload = Synthetic(SHADING_BOUND, noise=0.001)
     result = search(SMALL, workload, tmp_path / "measurements.jsonl", Budget(measurements=40), max_error=max_error)
     assert result.best.error == pytest.approx(expected, abs=0.0011)
+    assert (result.best.params["gbuffer"] == "float32") == (expected != 0.01)
+    assert result.best.params["light_cutoff"] == (0.1 if expected == 0.1 else 0.0)
     assert result.best.error is not None
     assert result.best.error <= max_error
 

@@ -49,7 +49,7 @@ def test_a_sphere_that_just_reaches_a_corner_meets_it(centre, direction, size, e
     centre = np.array(centre, np.float32)
     outside = np.maximum(np.maximum(low - centre, centre - high), 0).astype(np.float64)
     radius = np.float32(np.sqrt((outside**2).sum()) * (1 + excess))
-    arrays = centre[None], radius[None], low[None], high[None]
+    arrays = centre[None], np.array([radius]), low[None], high[None]
     if oracles.spheres_in_boxes(*arrays)[0, 0]:
         assert meets(centre, radius, low, high)
     if not oracles.spheres_in_boxes(*arrays, share=1 + SLACK)[0, 0]:

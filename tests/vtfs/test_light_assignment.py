@@ -35,7 +35,7 @@ BATCH = 1024  # small chunks: a chunk's cost does not depend on how much of it i
 
 
 def listed_lights(config, inputs):
-    """Which lights each cluster lists, bool `[clusters, lights]`, and each pixel's cluster, after checking the lists."""
+    """Lights of each cluster, bool `[clusters, lights]`, and each pixel's cluster, after checking the lists."""
     env, _ = run_stages(config, inputs, until="assign")
     clusters, lists = env["clusters"], env["assign"][0]
     n_clusters, n_lights = int(clusters.n_clusters), inputs.n_lights
@@ -207,6 +207,11 @@ def clusters_of(low, high):
     return Clusters(zeros, box, n, zeros, zeros, n, jnp.zeros((1, 32), jnp.int32), jnp.bool_(False))
 
 
+def as_spheres(centre, radius):
+    x_m, y_m, z_m = jnp.asarray(centre.T)
+    return Sphere(x_m, y_m, z_m, jnp.asarray(radius))
+
+
 def by_brute_force(spheres, clusters, branching, chunk):
     return assign_brute_force(spheres, clusters, CAPACITY, chunk)
 
@@ -244,7 +249,7 @@ def lists_of(lists):
 @few
 def test_lists_are_those_of_float64_within_the_slack(how, n_lights, branching, spread, seed):
     low, high, centre, radius = boxes_and_spheres(n_lights, spread, seed)
-    spheres = Sphere(*jnp.asarray(centre.T), jnp.asarray(radius))
+    spheres = as_spheres(centre, radius)
     lists, _ = assign(how, spheres, clusters_of(low, high), branching, 256)
     must = oracles.spheres_in_boxes(centre, radius, low, high)
     # 1e-6 on the squared radius, and as much for rounding, is 1e-6 on the radius.
@@ -258,7 +263,7 @@ def test_lists_are_those_of_float64_within_the_slack(how, n_lights, branching, s
 @pytest.mark.parametrize("chunk", [32, 2**20])
 def test_the_chunk_never_changes_a_list(how, chunk):
     low, high, centre, radius = boxes_and_spheres(200, 3.0, 3)
-    spheres, clusters = Sphere(*jnp.asarray(centre.T), jnp.asarray(radius)), clusters_of(low, high)
+    spheres, clusters = as_spheres(centre, radius), clusters_of(low, high)
     expected, counts = assign(how, spheres, clusters, 8, 256)
     lists, same_counts = assign(how, spheres, clusters, 8, chunk)
     assert [a.tolist() for a in lists_of(lists)] == [a.tolist() for a in lists_of(expected)]
@@ -267,9 +272,7 @@ def test_the_chunk_never_changes_a_list(how, chunk):
 
 def test_brute_force_lists_in_ascending_order():
     low, high, centre, radius = boxes_and_spheres(200, 3.0, 4)
-    lists, _ = assign(
-        by_brute_force, Sphere(*jnp.asarray(centre.T), jnp.asarray(radius)), clusters_of(low, high), 32, 256
-    )
+    lists, _ = assign(by_brute_force, as_spheres(centre, radius), clusters_of(low, high), 32, 256)
     assert all((np.diff(found) > 0).all() for found in lists_of(lists))
 
 

@@ -74,8 +74,9 @@ def test_very_long_lists_lose_no_light(batch):
     lengths, capacity = np.array([16_390, 16_500]), 2**18
     samples, _, gbuffer = a_frame(Viewport(16, 4), 1, 0)
     zeros = jnp.zeros(capacity, jnp.int32)
+    two = zeros.at[:2].set(jnp.arange(2, dtype=jnp.int32))
     clusters = Clusters(
-        zeros, Aabb(*(jnp.zeros(1),) * 6), jnp.int32(2), zeros.at[:2].set(jnp.arange(2)), zeros.at[:2].set(jnp.arange(2)),
+        zeros, Aabb(*(jnp.zeros(1),) * 6), jnp.int32(2), two, two,
         jnp.int32(2), jnp.broadcast_to(jnp.arange(2, dtype=jnp.int32)[:, None], (2, 32)), jnp.bool_(False),
     )  # fmt: skip
     # All but the last entry of each list name a black light.
