@@ -75,9 +75,9 @@ class Space:
 def default_space(techniques: Iterable[str], n_samples: int) -> Space:
     """What is searched unless the user says otherwise: settings that change the speed and not the image.
 
-    **Arguments:**
-
     Small on purpose: each branching and batch compiles programs of its own, each grid is counted.
+
+    **Arguments:**
 
     - `n_samples`: view samples of a frame. A batch that holds them all is the same as `batch = 0`.
     """
@@ -156,13 +156,7 @@ def _parameter_values(name: str, given: object, techniques: tuple[str, ...]) -> 
         )
     if not isinstance(given, list) or not given:
         raise InputError(f"`parameters.{name}` = {given!r}: must be a list of values, each {PARAMETERS[name].allowed}.")
-    parsed = []
-    for value in given:
-        try:
-            parsed.append(PARAMETERS[name].parse(value))
-        except OverflowError as error:  # a whole number cannot be made of `inf`
-            raise InputError(f"`parameters.{name}` = {value!r}: must be {PARAMETERS[name].allowed}.") from error
-    return tuple(dict.fromkeys(parsed))
+    return tuple(dict.fromkeys(PARAMETERS[name].parse(value) for value in given))
 
 
 def _space(techniques: tuple[str, ...], values: Mapping[str, tuple[Value, ...]], constraints: tuple[str, ...]) -> Space:

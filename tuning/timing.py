@@ -11,6 +11,9 @@ MIN_REPEATS = 3
 PRECISION = 0.02
 """Half of what the 95 % interval of the median may span, relative to the median."""
 
+MIN_S = 0.1
+"""Least time spent on one frame: a GPU's first milliseconds after a compile are up to half as slow again."""
+
 CAP_S = 2.0
 """Most time spent on one frame, once it has `MIN_REPEATS`."""
 
@@ -34,7 +37,7 @@ def repeats_ms(
     started = time.perf_counter()
     while True:
         times.append(timed_ms(run))
-        if len(times) < MIN_REPEATS:
+        if len(times) < MIN_REPEATS or time.perf_counter() - started < MIN_S:
             continue
         low, high = median_interval(times)
         middle = (low + high) / 2

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import tuning.timing
 from tuning.choose import median_interval
-from tuning.timing import MIN_REPEATS, PRECISION, interleaved_ms, repeats_ms, timed_ms
+from tuning.timing import MIN_REPEATS, MIN_S, PRECISION, interleaved_ms, repeats_ms, timed_ms
 
 
 class FakeClock:
@@ -39,7 +39,7 @@ def test_one_run_is_timed_from_its_start_to_its_end(monkeypatch):
 
 def test_times_that_agree_need_six_repeats(monkeypatch):
     """Below six no interval is one of 95 %."""
-    assert repeats_ms(FakeClock(monkeypatch, [10.0]).runs[0], never) == pytest.approx((10.0,) * 6)
+    assert repeats_ms(FakeClock(monkeypatch, [100.0]).runs[0], never) == pytest.approx((100.0,) * 6)
 
 
 def test_three_repeats_even_where_one_is_over_the_cap(monkeypatch):
@@ -53,8 +53,8 @@ def test_three_repeats_even_where_all_is_decided(monkeypatch):
         seen.append(interval)
         return True
 
-    assert len(repeats_ms(FakeClock(monkeypatch, [3.0, 1.0, 2.0]).runs[0], decided)) == MIN_REPEATS
-    assert np.allclose(seen, [(1.0, 3.0)])  # asked once, with what the three runs say
+    assert len(repeats_ms(FakeClock(monkeypatch, [300.0, 100.0, 200.0]).runs[0], decided)) == MIN_REPEATS
+    assert np.allclose(seen, [(100.0, 300.0)])  # asked once, with what the three runs say
 
 
 def test_times_that_disagree_are_repeated_up_to_the_cap(monkeypatch):
@@ -74,7 +74,8 @@ def test_repeats_stop_where_they_are_precise_or_cost_too_much_and_no_earlier(tim
 
     def done(n):
         low, high = median_interval(times[:n])
-        return (n >= 6 and high - low <= PRECISION * (low + high)) or sum(times[:n]) >= cap_s * 1e3
+        precise = n >= 6 and high - low <= PRECISION * (low + high)
+        return sum(times[:n]) >= MIN_S * 1e3 and (precise or sum(times[:n]) >= cap_s * 1e3)
 
     assert len(times) >= MIN_REPEATS and done(len(times))
     assert not any(done(n) for n in range(MIN_REPEATS, len(times)))

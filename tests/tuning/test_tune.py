@@ -14,7 +14,7 @@ import pytest
 import tuning.workload
 from tests.command_line import SMALL, finished, is_refused, short_repeats, started, vtfs
 from tuning.record import read_measurements
-from vtfs.camera import save_cameras
+from vtfs.camera import Viewport, save_cameras
 from vtfs.frame import CapacityError, frame_program
 from vtfs.gallery import build_scene
 from vtfs.lights import save_lights
@@ -33,6 +33,10 @@ def _quick(tmp_path, monkeypatch):
     Path("forward.toml").write_text("[parameters]\nbatch = [0]\n")
     with short_repeats():
         yield
+
+
+def small_setup():
+    return set_up(SceneOptions("street", viewport=Viewport(64, 36), n_triangles=1000, lights="20"))
 
 
 def tune(*arguments, scene=SMALL, out="out", space="space.toml"):
@@ -96,7 +100,7 @@ def test_files_of_ones_own(suffix):
     assert scene.cameras is not None
     save_scene(scene, Path("Straße.x").with_suffix(suffix))
     save_cameras("cameras.json", scene.cameras)
-    save_lights("lights.csv", set_up(SceneOptions("street", n_triangles=1000, lights="20")).lights)
+    save_lights("lights.csv", small_setup().lights)
     files = (f"Straße{suffix}", "--cameras", "cameras.json", "--lights", "lights.csv", "--size", "64x36")
     result = result_of(tune("--budget", "3", scene=files))
     is_complete(result)
@@ -105,13 +109,11 @@ def test_files_of_ones_own(suffix):
 
 @pytest.mark.parametrize("n_frames", [1, 3])
 def test_view_samples_of_ones_own_renderer(n_frames):
-    setup = set_up(SceneOptions("street", viewport=None, n_triangles=1000, lights="20"))
-    cameras = setup.cameras.resized(type(setup.cameras.viewport)(64, 36))
-    save_cameras("cameras.json", cameras)
+    setup = small_setup()
+    save_cameras("cameras.json", setup.cameras)
     Path("frames").mkdir()
-    own = set_up(SceneOptions("street", viewport=cameras.viewport, n_triangles=1000, lights="20"))
     for frame in range(n_frames):
-        save_gbuffer(f"frames/{frame:04d}.npz", own.samples(frame))
+        save_gbuffer(f"frames/{frame:04d}.npz", setup.samples(frame))
     scene = "frames" if n_frames > 1 else "frames/0000.npz"
     result = result_of(tune("--budget", "3", scene=(scene, "--cameras", "cameras.json", "--lights", "20")))
     is_complete(result)
