@@ -27,7 +27,9 @@ def files(name: str) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("name", ["willow_garage_office", "japanese_bridge_garden"])
 def test_counts_and_pictures(name, tmp_path):
-    counted = vtfs("count", *files(name), *SIZE, *LIGHTS, "--technique", "volume_tiled_bvh", "--frame", "0", "--json", "-")
+    counted = vtfs(
+        "count", *files(name), *SIZE, *LIGHTS, "--technique", "volume_tiled_bvh", "--frame", "0", "--json", "-"
+    )
     assert counted.code == 0 and counted.err == ""
     (counts,) = counted.json["frames"]
     assert counts["samples"] > 0.3 * 320 * 180 and counts["lighting_computations"] > counts["samples"]

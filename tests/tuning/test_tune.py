@@ -63,7 +63,9 @@ def is_complete(result, out="out"):
     assert {"name", "triangles", "lights", "frames"} <= set(result["scene"])
     assert {"technique", "params", "time_ms"} <= set(result["default"])
     assert {"technique", "params", "time_ms", "time_ms_interval"} <= set(result["best"])
-    assert result["pareto"] and all({"technique", "params", "time_ms", "error"} <= set(point) for point in result["pareto"])
+    assert result["pareto"] and all(
+        {"technique", "params", "time_ms", "error"} <= set(point) for point in result["pareto"]
+    )
     model_keys = {"technique", "stage", "terms", "dropped", "coefficients", "loo_error"}
     assert all(model_keys <= set(model) for model in result["cost_models"])
     best = result["best"]
@@ -138,13 +140,19 @@ def test_the_mean_of_the_frames_is_an_objective():
     for m in read_measurements("out/measurements.jsonl"):
         assert all(m.stages_ms["frame"])  # no frame is left out: each counts
         if (m.technique, m.params) == (result["best"]["technique"], result["best"]["params"]):
-            assert result["best"]["time_ms"] == pytest.approx(np.mean([np.median(frame) for frame in m.stages_ms["frame"]]))
+            assert result["best"]["time_ms"] == pytest.approx(
+                np.mean([np.median(frame) for frame in m.stages_ms["frame"]])
+            )
 
 
 @pytest.mark.parametrize("max_error", ["0.5", "1e-5"])
 def test_a_larger_error_allows_what_changes_the_image(max_error):
-    result = result_of(tune("--techniques", "forward", "--budget", "20", "--max-error", max_error, space="forward.toml"))
-    allowed = [m for m in read_measurements("out/measurements.jsonl") if m.error is not None and m.error <= float(max_error)]
+    result = result_of(
+        tune("--techniques", "forward", "--budget", "20", "--max-error", max_error, space="forward.toml")
+    )
+    allowed = [
+        m for m in read_measurements("out/measurements.jsonl") if m.error is not None and m.error <= float(max_error)
+    ]
     fastest = min(allowed, key=lambda m: max(np.median(frame) for frame in m.stages_ms["frame"] if frame))
     assert (result["best"]["technique"], result["best"]["params"]) == (fastest.technique, fastest.params)
     assert any(m.params["gbuffer"] != "float32" for m in allowed) == (max_error == "0.5")
@@ -208,7 +216,9 @@ def test_a_run_that_was_cut_anywhere_goes_on():
     result_of(tune("--budget", "4"))
     whole = b"".join(lines_of())
     ends = np.cumsum([len(line) for line in lines_of()])
-    for k, length in enumerate([0, 10, ends[0] - 1, ends[0], ends[1] - 2, ends[1] + 1, (ends[1] + ends[2]) // 2, ends[3] - 1]):
+    for k, length in enumerate(
+        [0, 10, ends[0] - 1, ends[0], ends[1] - 2, ends[1] + 1, (ends[1] + ends[2]) // 2, ends[3] - 1]
+    ):
         out = f"cut{k}"
         Path(out).mkdir()
         Path(out, "measurements.jsonl").write_bytes(whole[:length])
@@ -271,7 +281,10 @@ def raising(error):
 
 
 FAILURES = {
-    "device memory": (raising(jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte.\nmore")), "out_of_memory"),
+    "device memory": (
+        raising(jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte.\nmore")),
+        "out_of_memory",
+    ),
     "device error": (raising(jax.errors.JaxRuntimeError("INTERNAL: broken")), "failed"),
     "empty message": (raising(jax.errors.JaxRuntimeError("")), "failed"),
     "host memory": (raising(MemoryError()), "out_of_memory"),
@@ -310,13 +323,20 @@ def test_a_frame_that_takes_too_long_is_a_line(monkeypatch):
 def test_a_stage_that_fails_by_itself_is_a_line(monkeypatch):
     monkeypatch.setattr(tuning.workload, "run_stages", lambda *_: raising(MemoryError())(None))
     result = result_of(tune("--budget", "3"))
-    assert {m.outcome for m in read_measurements("out/measurements.jsonl") if m.technique != "forward"} == {"out_of_memory"}
+    assert {m.outcome for m in read_measurements("out/measurements.jsonl") if m.technique != "forward"} == {
+        "out_of_memory"
+    }
     assert result["best"]["technique"] == "forward" and result["failed"] == 2
 
 
 def test_where_all_fail_that_is_said_in_one_line(monkeypatch):
     broken_frames(monkeypatch, "forward", raising(MemoryError()))
-    is_refused(tune("--budget", "2", "--techniques", "forward", space="forward.toml"), "configurations", "out_of_memory", "smaller size")
+    is_refused(
+        tune("--budget", "2", "--techniques", "forward", space="forward.toml"),
+        "configurations",
+        "out_of_memory",
+        "smaller size",
+    )
     assert len(lines_of()) == 1
 
 
@@ -337,7 +357,11 @@ def test_a_half_precision_image_may_be_infinite(monkeypatch):
 @pytest.mark.xfail(reason="the search counts before it measures, and lets what counting raises through")
 @pytest.mark.parametrize(
     "error",
-    [CapacityError("pairs: 9 needed, at most 8 fit."), MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: x")],
+    [
+        CapacityError("pairs: 9 needed, at most 8 fit."),
+        MemoryError(),
+        jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: x"),
+    ],
     ids=["capacity", "host memory", "device memory"],
 )
 def test_what_cannot_even_be_counted_is_a_line_too(error, monkeypatch):

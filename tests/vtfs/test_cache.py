@@ -49,7 +49,9 @@ def test_it_is_made_once_and_read_as_it_was(folder):
     assert len(list((folder / "kind").iterdir())) == 1
 
 
-@pytest.mark.parametrize("other", [("kind", ("one",)), ("kind", ("two", "one")), ("sort", ("one", "two")), ("kind", ())])
+@pytest.mark.parametrize(
+    "other", [("kind", ("one",)), ("kind", ("two", "one")), ("sort", ("one", "two")), ("kind", ())]
+)
 def test_another_kind_or_part_is_another_thing(folder, other):
     cached("kind", ("one", "two"), Made())
     make = Made({"b": np.ones(2)})

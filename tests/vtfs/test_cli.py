@@ -90,7 +90,20 @@ def test_doctor_names_the_device_the_versions_and_the_cache():
 
 
 def test_counts_as_json_are_those_of_the_api():
-    ran = vtfs("count", *SMALL, "--technique", "volume_tiled_bvh", "--set", "tile_px=16", "--frame", "0", "--frame", "7", "--json", "-")
+    ran = vtfs(
+        "count",
+        *SMALL,
+        "--technique",
+        "volume_tiled_bvh",
+        "--set",
+        "tile_px=16",
+        "--frame",
+        "0",
+        "--frame",
+        "7",
+        "--json",
+        "-",
+    )
     assert ran.code == 0 and ran.err == ""
     assert set(ran.json) == {"technique", "params", "scene", "frames"}
     config, setup = configuration("volume_tiled_bvh", {"tile_px": 16}), small_setup()
@@ -125,7 +138,16 @@ def test_a_space_of_counts_is_a_csv_that_holds_single_counts():
     ]
     for row in rows[1::3]:
         single = vtfs(
-            "count", *SMALL, "--frame", row["frame"], "--set", f"tile_px={row['tile_px']}", "--set", f"batch={row['batch']}", "--json", "-"
+            "count",
+            *SMALL,
+            "--frame",
+            row["frame"],
+            "--set",
+            f"tile_px={row['tile_px']}",
+            "--set",
+            f"batch={row['batch']}",
+            "--json",
+            "-",
         ).json
         assert {name: int(row[name]) for name in single["frames"][0]} == single["frames"][0]
 
@@ -148,7 +170,9 @@ def test_render_writes_an_image_and_a_heat_map(technique):
     for kind in ("image", "heat_map"):
         with Image.open(written[kind]) as picture:
             assert picture.size == (64, 36)
-            assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > (50 if kind == "image" else 0)
+            assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > (
+                50 if kind == "image" else 0
+            )
 
 
 @pytest.mark.parametrize("technique", TECHNIQUES)
@@ -163,7 +187,20 @@ def test_a_camera_that_sees_nothing(technique):
 
 
 def test_one_pixel_and_one_light():
-    ran = vtfs("render", "street", "--triangles", "1000", "--size", "1x1", "--lights", "1", "--technique", "forward", "--json", "-")
+    ran = vtfs(
+        "render",
+        "street",
+        "--triangles",
+        "1000",
+        "--size",
+        "1x1",
+        "--lights",
+        "1",
+        "--technique",
+        "forward",
+        "--json",
+        "-",
+    )
     assert ran.code == 0 and ran.err == ""
     with Image.open(ran.json["pictures"][0]["image"]) as picture:
         assert picture.size == (1, 1)
@@ -190,7 +227,9 @@ def test_a_scene_of_ones_own_with_a_name_of_ones_own(suffix, tmp_path):
     save_scene(scene, path)
     save_cameras("cameras.json", scene.cameras)
     assert load_cameras("cameras.json").key == scene.cameras.key
-    ran = vtfs("count", path, "--cameras", "cameras.json", "--lights", "20", "--size", "64x36", "--frame", "0", "--json", "-")
+    ran = vtfs(
+        "count", path, "--cameras", "cameras.json", "--lights", "20", "--size", "64x36", "--frame", "0", "--json", "-"
+    )
     assert ran.code == 0 and ran.json["scene"]["triangles"] == scene.n_triangles
     # The same surfaces at the same pixels, but for coordinates in float32 and lights scattered in their box.
     expected = small_setup().samples(0).n_valid

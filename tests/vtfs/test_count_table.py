@@ -47,7 +47,11 @@ def test_rows_are_those_of_counting_one_by_one(setup, rows):
 
 def test_a_batch_changes_the_steps_and_nothing_else(rows):
     at_once, in_chunks = rows[0].counts, rows[1].counts
-    assert {name for name in at_once if at_once[name] != in_chunks[name]} <= {"shading_lanes", "shading_steps", "assign_steps"}
+    assert {name for name in at_once if at_once[name] != in_chunks[name]} <= {
+        "shading_lanes",
+        "shading_steps",
+        "assign_steps",
+    }
     assert at_once["shading_steps"] != in_chunks["shading_steps"]
 
 
@@ -56,7 +60,9 @@ def test_a_csv_holds_every_configuration_and_count(rows):
     assert len(read) == len(rows)
     for line, row in zip(read, rows, strict=True):
         assert None not in line and line["technique"] == row.configuration.technique and int(line["frame"]) == row.frame
-        assert {name: line[name] for name in row.configuration.params} == {k: str(v) for k, v in row.configuration.params.items()}
+        assert {name: line[name] for name in row.configuration.params} == {
+            k: str(v) for k, v in row.configuration.params.items()
+        }
         assert {name: int(line[name]) for name in row.counts} == row.counts
         others = line.keys() - {"technique", "frame"} - row.configuration.params.keys() - row.counts.keys()
         assert all(line[name] == "" for name in others)  # what forward does not have
@@ -78,14 +84,22 @@ NAMES = ("samples", "cells_total", "clusters_occupied", "light_cluster_pairs", "
 
 @pytest.mark.parametrize(
     ("technique", "tile_px", "depth_slices"),
-    [("tiled_deferred", 32, None), ("tiled_deferred", 7, None), ("volume_tiled_bvh", 16, 0), ("volume_tiled_bvh", 5, 24)],
+    [
+        ("tiled_deferred", 32, None),
+        ("tiled_deferred", 7, None),
+        ("volume_tiled_bvh", 16, 0),
+        ("volume_tiled_bvh", 5, 24),
+    ],
 )
 def test_the_command_counts_what_the_definitions_say(technique, tile_px, depth_slices):
-    """To 0.1 %: float32 decides a light that ends at a cell's face otherwise, and cells are grown by 1e-5 of their depth."""
-    scene = ("grove", "--triangles", "3000", "--size", "96x54", "--lights", "50")
-    settings = ("--set", f"tile_px={tile_px}") + (("--set", f"depth_slices={depth_slices}") if depth_slices is not None else ())
+    """To 0.1 %: float32 decides a light that ends at a cell's face otherwise, and cells are grown by
+    1e-5 of their depth and some hundredths of a pixel."""
+    scene = ("grove", "--triangles", "3000", "--size", "320x180", "--lights", "100")
+    settings = ("--set", f"tile_px={tile_px}") + (
+        ("--set", f"depth_slices={depth_slices}") if depth_slices is not None else ()
+    )
     ran = vtfs("count", *scene, "--technique", technique, *settings, "--frame", "0", "--frame", "33", "--json", "-")
-    setup = set_up(SceneOptions("grove", viewport=Viewport(96, 54), n_triangles=3000, lights="50"))
+    setup = set_up(SceneOptions("grove", viewport=Viewport(320, 180), n_triangles=3000, lights="100"))
     for record in ran.json["frames"]:
         samples = setup.samples(record["frame"])
         expected = slow_counts(

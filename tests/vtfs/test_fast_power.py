@@ -24,7 +24,11 @@ def check(base, exponent, result=None):
     assert ((result >= 0) & (result < 2e-6))[~large].all()
 
 
-@given(seed=st.integers(0, 2**32 - 1), nearness=st.sampled_from([1.0, 1e-2, 1e-4, 1e-6]), longest=st.sampled_from([1.0, 64.0, 2048.0]))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    nearness=st.sampled_from([1.0, 1e-2, 1e-4, 1e-6]),
+    longest=st.sampled_from([1.0, 64.0, 2048.0]),
+)
 @settings(max_examples=60, deadline=None)
 def test_powers_are_within_their_bound(seed, nearness, longest):
     """Highlights are near 1, by any power of ten."""

@@ -165,5 +165,7 @@ def test_a_folder_without_samples_is_refused(tmp_path):
 
 @pytest.mark.parametrize("lights", ["-5", "10000001", "1" * 30])
 def test_a_number_of_lights_out_of_range_is_refused(lights):
-    with pytest.raises(InputError, match=rf"lights {lights}: must be a lights\.csv, or a number of lights from 0 to 10,000,000"):
+    with pytest.raises(
+        InputError, match=rf"lights {lights}: must be a lights\.csv, or a number of lights from 0 to 10,000,000"
+    ):
         set_up(replace(SMALL, lights=lights))
