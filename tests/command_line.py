@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import io
 import json
@@ -91,6 +92,22 @@ def short_repeats() -> Iterator[None]:
 
     quick = functools.partial(repeats_ms, cap_s=_FRAME_CAP_S)
     with mock.patch("tuning.workload.repeats_ms", quick), mock.patch("tuning.workload._DUEL_CAP_S", _FRAME_CAP_S):
+        yield
+
+
+@contextlib.contextmanager
+def full_disk(folder: str, nth: int) -> Iterator[None]:
+    """The disk is full from the n-th file on that is written below `folder` (each is made sure of by `fsync`)."""
+    calls, fsync = [], os.fsync
+
+    def full(handle: int) -> None:
+        if f"/{folder}/" in str(Path(f"/proc/self/fd/{handle}").readlink()):
+            calls.append(handle)
+            if len(calls) >= nth:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(handle)
+
+    with mock.patch("os.fsync", full):
         yield
 
 

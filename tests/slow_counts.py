@@ -1,4 +1,4 @@
-"""Counts of a frame from their definitions, in float64 NumPy: nothing of the grid, the clusters or the lists is used."""
+"""Counts of a frame from their definitions, in float64 NumPy: no grid, clusters or lists of the code under test."""
 
 from __future__ import annotations
 

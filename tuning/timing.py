@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from tuning.choose import median_interval
 
@@ -46,7 +46,7 @@ def repeats_ms(
             return tuple(times)
 
 
-def interleaved_ms(runs: list[Callable[[], object]], rounds: int, cap_s: float) -> list[tuple[float, ...]]:
+def interleaved_ms(runs: Sequence[Callable[[], object]], rounds: int, cap_s: float) -> list[tuple[float, ...]]:
     """Times of several runs taken in turns, so that a drift of the machine's speed meets all of them.
 
     At least three rounds, then until `rounds` or `cap_s`.

@@ -1,6 +1,5 @@
 """The main job from the command line: files, budgets, resuming, failures; on scenes that take a second."""
 
-import errno
 import json
 import os
 import signal
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 
 import tuning.workload
-from tests.command_line import SMALL, finished, is_refused, short_repeats, started, vtfs
+from tests.command_line import SMALL, finished, full_disk, is_refused, short_repeats, started, vtfs
 from tuning.record import read_measurements
 from vtfs.camera import Viewport, save_cameras
 from vtfs.frame import CapacityError, frame_program
@@ -58,7 +57,8 @@ def configurations_of(out="out"):
 
 def is_complete(result, out="out"):
     """Every key that programs rely on, every file, and a recommendation that was measured."""
-    keys = "schema scene device versions seed space_size measured compiled_programs compile_s wall_s default best pareto cost_models"
+    keys = "schema scene device versions seed space_size measured compiled_programs compile_s wall_s "
+    keys += "default best pareto cost_models"
     assert set(keys.split()) <= set(result)
     assert {"name", "triangles", "lights", "frames"} <= set(result["scene"])
     assert {"technique", "params", "time_ms"} <= set(result["default"])
@@ -382,22 +382,12 @@ def test_what_cannot_even_be_counted_is_a_line_too(error, monkeypatch):
 
 
 @pytest.mark.parametrize("nth", [1, 2, 3, 4, 6, 8])
-def test_a_full_disk_leaves_what_was_measured_and_nothing_half_written(nth, monkeypatch):
-    calls, fsync = [], os.fsync
-
-    def full(handle):
-        if "/out/" in os.readlink(f"/proc/self/fd/{handle}"):
-            calls.append(handle)
-            if len(calls) >= nth:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        fsync(handle)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
+def test_a_full_disk_leaves_what_was_measured_and_nothing_half_written(nth):
+    with full_disk("out", nth):
         ran = tune("--budget", "3")
     assert ran.code == 2 and ran.err.count("\n") == 1 and "No space left on device" in ran.err
     kept = min(max(nth - 2, 0), 3)  # the first is the probe of the folder
-    assert not Path("out/report.html").exists() and [f for f in Path("out").rglob(".*")] == []
+    assert not Path("out/report.html").exists() and list(Path("out").rglob(".*")) == []
     if nth > 1:
         assert len(configurations_of()) == kept
     assert not Path("out/result.json").exists() or json.loads(Path("out/result.json").read_text())

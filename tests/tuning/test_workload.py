@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import tuning.timing
 from tests.command_line import short_repeats
-from tuning.choose import is_timed, time_ms
+from tuning.choose import Objective, is_timed, time_ms
 from tuning.compiles import Compiles
 from tuning.space import Space, load_space
 from tuning.sweep import Budget, search
@@ -31,7 +31,7 @@ def setup():
     return set_up(SceneOptions("street", viewport=Viewport(64, 36), n_triangles=1000, lights="20"))
 
 
-def a_workload(setup, objective="max", frames=FRAMES) -> SceneWorkload:
+def a_workload(setup, objective: Objective = "max", frames=FRAMES) -> SceneWorkload:
     path = ScenePath(setup.key, frames, tuple(map(setup.samples, frames)), setup.lights, seed=0)
     return SceneWorkload(path, Compiles(), objective)
 

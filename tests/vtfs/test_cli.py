@@ -1,7 +1,6 @@
 """The command line as a new user meets it: help, counts, pictures, and one line for whatever is wrong."""
 
 import csv
-import errno
 import json
 import os
 import subprocess
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.command_line import ROOT, SMALL, STREET, finished, is_refused, started, vtfs
+from tests.command_line import ROOT, SMALL, STREET, Ran, finished, full_disk, is_refused, started, vtfs
 from vtfs.camera import Viewport, load_cameras, save_cameras
 from vtfs.frame import FrameInputs, count
 from vtfs.gallery import GALLERY, build_scene
@@ -260,7 +259,7 @@ def test_an_interrupt_says_so_in_one_line(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("vtfs.scene_setup.set_up", interrupted)
-    assert vtfs("count", *SMALL) == type(vtfs())(130, "", "vtfs: interrupted.\n")
+    assert vtfs("count", *SMALL) == Ran(130, "", "vtfs: interrupted.\n")
     ran = vtfs("tune", *SMALL)
     assert ran.code == 130 and "--resume" in ran.err and ran.err.count("\n") == 1
 
@@ -443,13 +442,13 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_done(comm
 @pytest.mark.parametrize("folder", ["none", "empty", "file"])
 def test_a_report_of_what_is_no_run(folder):
     write("file", "")
-    os.mkdir("empty")
+    Path("empty").mkdir()
     is_refused(vtfs("report", folder), folder)
 
 
 def test_a_bad_scene_leaves_nothing_behind():
     is_refused(vtfs("count", "none.glb", "--json", "x.json"))
-    assert os.listdir() == []
+    assert list(Path().iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -457,23 +456,8 @@ def test_a_bad_scene_leaves_nothing_behind():
     [("render", *SMALL, "--out", "out"), ("count", *SMALL, "--frame", "0", "--json", "out/counts.json")],
     ids=["render", "count"],
 )
-def test_a_full_disk_leaves_nothing_half_written(arguments, monkeypatch):
-    vtfs(*arguments[:-2], arguments[-2], "warm/up.json" if arguments[0] == "count" else "warm")
-    fail_to_write_below("out", 2 if arguments[0] == "render" else 1, monkeypatch)
-    ran = vtfs(*arguments)
+def test_a_full_disk_leaves_nothing_half_written(arguments):
+    with full_disk("out", 2 if arguments[0] == "render" else 1):
+        ran = vtfs(*arguments)
     assert ran.code == 2 and ran.err.count("\n") == 1 and "No space left on device" in ran.err
-    assert not os.path.exists("out") or os.listdir("out") == []
-
-
-def fail_to_write_below(folder, nth, monkeypatch):
-    """The disk is full from the n-th file on that is made sure of below `folder`."""
-    calls, fsync = [], os.fsync
-
-    def full(handle):
-        if f"/{folder}/" in os.readlink(f"/proc/self/fd/{handle}"):
-            calls.append(handle)
-            if len(calls) >= nth:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        fsync(handle)
-
-    monkeypatch.setattr(os, "fsync", full)
+    assert not Path("out").exists() or list(Path("out").iterdir()) == []
