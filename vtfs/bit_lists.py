@@ -16,6 +16,8 @@ from jaxtyping import Array, Bool, Int, UInt32
 
 WORD_BITS = 32
 
+_SATURATED = 2**30
+
 
 def pack_bits(mask: Bool[Array, "*rows bits"]) -> UInt32[Array, "*rows words"]:
     """Bits of each row as 32-bit words, lowest first; `bits` is at most 32, or a multiple of 32."""
@@ -130,7 +132,8 @@ def gather_hits(
         # What does not fit is counted, not written: the caller throws the result away.
         end = jnp.minimum(n_hits, capacity - total)
         _, columns = jax.lax.while_loop(lambda state: state[0] < end, write, (jnp.int32(0), columns))
-        return columns, total + n_hits
+        # Saturates: past 2^31 a total would be negative, and look as if it fitted.
+        return columns, jnp.minimum(total, _SATURATED) + n_hits
 
     def test_chunk(state):
         first, columns, total = state

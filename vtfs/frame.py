@@ -13,6 +13,7 @@ import numpy as np
 from vtfs.cluster_grid import cluster_grid, n_cells
 from vtfs.clusters import Clusters
 from vtfs.gbuffer import GBuffer, from_runs, gbuffer_on_device, positions_on_device
+from vtfs.input_error import InputError
 from vtfs.light_lists import view_lights
 from vtfs.lights import Lights
 from vtfs.op_counts import (
@@ -34,7 +35,7 @@ from vtfs.view_samples import ViewSamples
 _BRUTE_FORCE_WORD = 32
 
 
-class CapacityError(RuntimeError):
+class CapacityError(InputError):
     """A frame needs more than the largest capacity: it is not run, and nothing is dropped."""
 
 
@@ -61,7 +62,7 @@ NO_SIZES = Sizes(0, 0, 0)
 
 _FIRST = Sizes(cells=2**18, blocks=2**10, pairs=2**20)
 _RATIO = Sizes(cells=8, blocks=4, pairs=8)
-_LARGEST = Sizes(cells=2**31, blocks=2**26, pairs=2**28)
+_LARGEST = Sizes(cells=2**30, blocks=2**26, pairs=2**28)
 
 
 def rounded_up(name: str, needed: int) -> int:
@@ -72,9 +73,9 @@ def rounded_up(name: str, needed: int) -> int:
     capacity, ratio, largest = (getattr(sizes, name) for sizes in (_FIRST, _RATIO, _LARGEST))
     while capacity < needed:
         capacity *= ratio
-    if capacity > largest:
-        raise CapacityError(f"{name}: {needed:,} needed, at most {largest:,} fit.")
-    return capacity
+    if needed > largest:
+        raise CapacityError(f"{name}: {needed:,} needed, at most {largest:,} fit; use larger tiles or fewer lights.")
+    return min(capacity, largest)
 
 
 class FrameInputs:
@@ -126,6 +127,15 @@ def narrowed(stage: Stage, plan: Plan) -> Plan:
     return Plan(**{name: getattr(plan, name) for name in stage.statics})
 
 
+def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
+    """Add a stage's result to what later stages may need. An assignment's counts stay apart from its lists: their
+    shape depends on the tree, and would compile the shading again for every branching."""
+    if stage == "assign":
+        env["assign"], env["assign_counts"] = result
+    else:
+        env[stage] = result
+
+
 @functools.cache
 def frame_program(technique: str, plan: Plan) -> Callable[..., Any]:
     """All stages fused in one program: from the inputs to the image and whether anything overflowed."""
@@ -134,9 +144,9 @@ def frame_program(technique: str, plan: Plan) -> Callable[..., Any]:
     def run(env: dict[str, Any]):
         env = dict(env)
         for stage in stages:
-            env[stage.name] = stage.run(plan, *(env[name] for name in stage.needs))
+            keep_result(env, stage.name, stage.run(plan, *(env[name] for name in stage.needs)))
         overflowed = [env["clusters"].overflowed] if "clusters" in env else []
-        overflowed += [env["assign"][0].overflowed] if "assign" in env else []
+        overflowed += [env["assign"].overflowed] if "assign" in env else []
         return env["shade_opaque"], jax.numpy.stack(overflowed).any() if overflowed else np.bool_(False)
 
     return jax.jit(run)
@@ -173,7 +183,7 @@ def run_stages(
                 sizes = replace(sizes, pairs=rounded_up("pairs", needed))
             else:
                 break
-        env[stage.name] = result
+        keep_result(env, stage.name, result)
         if stage.name == until:
             break
     return env, sizes
@@ -184,7 +194,7 @@ def lengths_of(env: dict[str, Any], inputs: FrameInputs) -> ListLengths:
     if "assign" not in env:
         return uniform_lengths(env["gbuffer"], inputs.n_lights)
     clusters: Clusters = env["clusters"]
-    return list_lengths(env["gbuffer"], clusters, env["assign"][0])
+    return list_lengths(env["gbuffer"], clusters, env["assign"])
 
 
 @dataclass(frozen=True)
@@ -241,8 +251,8 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     rows: tuple[int, ...] = ()
     if is_listed(config):
         counts |= cluster_counts(lengths, n_cells(env["grid"], inputs.positions.viewport), inputs.n_lights)
-        counts |= assign_counts(env["assign"][1], inputs.n_lights, branching)
-        rows = walk_rows(env["assign"][1])
+        counts |= assign_counts(env["assign_counts"], inputs.n_lights, branching)
+        rows = walk_rows(env["assign_counts"])
     structures = [value for name, value in env.items() if name not in ("positions", "gbuffer", "grid", "light_cutoff")]
     counts |= memory_counts(env["gbuffer"], structures, n_samples, counts.get("light_cluster_pairs", 0))
     return FrameCounts(counts, lengths.of_block, rows, branching, sizes), lengths
@@ -256,7 +266,9 @@ def is_listed(config: Configuration) -> bool:
 def render(config: Configuration, inputs: FrameInputs) -> np.ndarray:
     """The image of a configuration by its fused program: linear, float32 `[h, w, 3]`, 0 where invalid."""
     sizes = run_stages(config, inputs, until="assign")[1] if is_listed(config) else NO_SIZES
-    image, _ = frame_program(config.technique, planned(config, sizes))(inputs.environment(config))
+    image, overflowed = frame_program(config.technique, planned(config, sizes))(inputs.environment(config))
+    if bool(overflowed):
+        raise CapacityError(f"{config}: the frame no longer fits the capacities that its sizing run found.")
     return image_on_host(image, inputs)
 
 

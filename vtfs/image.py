@@ -25,7 +25,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB (ITU-R BT.709)
 def tone_map(image: np.ndarray, scale: float) -> np.ndarray:
     """Linear HDR `[h, w, 3]` to sRGB bytes: extended Reinhard on luminance, white at four times the
     exposed level (Reinhard et al. 2002, Eq. 4)."""
-    exposed = np.maximum(np.nan_to_num(image.astype(np.float64)), 0) * scale
+    exposed = np.nan_to_num(image.astype(np.float64), posinf=1e30).clip(0, 1e30) * scale
     luminance = exposed @ LUMINANCE
     mapped = luminance * (1 + luminance / 16) / (1 + luminance)
     linear = np.clip(exposed * (mapped / np.maximum(luminance, 1e-12))[..., None], 0, 1)
@@ -35,7 +35,7 @@ def tone_map(image: np.ndarray, scale: float) -> np.ndarray:
 
 def heat_map(counts: np.ndarray, largest: int, valid: np.ndarray) -> np.ndarray:
     """Counts `[h, w]` as sRGB bytes, 0 dark to `largest` bright; invalid pixels black."""
-    place = np.clip(counts / max(largest, 1), 0, 1) * (len(_HEAT) - 1)
+    place = np.clip(np.where(valid, counts, 0) / max(largest, 1), 0, 1) * (len(_HEAT) - 1)
     low = np.minimum(place.astype(int), len(_HEAT) - 2)
     share = (place - low)[..., None]
     colour = _HEAT[low] * (1 - share) + _HEAT[low + 1] * share

@@ -72,7 +72,7 @@ def reflected(
     h_x, h_y, h_z = to_x + e_x * distance, to_y + e_y * distance, to_z + e_z * distance
     n_dot_h = jnp.maximum(n_x * h_x + n_y * h_y + n_z * h_z, 0)
     cos2 = jnp.maximum(n_dot_h * n_dot_h / (h_x * h_x + h_y * h_y + h_z * h_z + _TINY), _TINY)
-    gloss = surface.specular * power(cos2, surface.shininess * 0.5)
+    gloss = jnp.where(n_dot_h > 0, surface.specular * power(cos2, surface.shininess * 0.5), 0)
     if light.shape[-1] > POINT_COLUMNS:
         along = -(to_x * light[..., 8] + to_y * light[..., 9] + to_z * light[..., 10])
         cos_cone = along / (distance + _TINY)

@@ -92,9 +92,14 @@ def _clusters(plan: Plan, positions: Positions, grid: ClusterGrid) -> Clusters:
     return form_clusters(positions, grid, plan.bounds, plan.cells, plan.blocks)
 
 
+_MAX_TESTS_AT_ONCE = 2**24  # their boxes take 400 MB
+
+
 def walk_chunk(batch: int, branching: int, pairs: int) -> int:
     """(cluster, node) pairs tested at once."""
-    return batch or min(pairs, _TESTS_AT_ONCE.get(jax.default_backend(), 2**22) // branching)
+    if batch:
+        return min(batch, _MAX_TESTS_AT_ONCE // branching)
+    return min(pairs, _TESTS_AT_ONCE.get(jax.default_backend(), 2**22) // branching)
 
 
 def _assign_brute_force(plan: Plan, lights: ViewLights, light_cutoff, clusters: Clusters) -> Assigned:
@@ -122,8 +127,10 @@ def _build_tree(plan: Plan, lights: ViewLights, light_cutoff, order) -> LightTre
     return build_light_tree(lights.spheres(light_cutoff), order, plan.branching)
 
 
-def _shade(plan: Plan, gbuffer: GBuffer, lights: ViewLights, light_cutoff, clusters: Clusters, lists) -> Image:
-    return shade(gbuffer, clusters, lists[0], lights.row, light_cutoff, plan.batch)
+def _shade(
+    plan: Plan, gbuffer: GBuffer, lights: ViewLights, light_cutoff, clusters: Clusters, lists: LightLists
+) -> Image:
+    return shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch)
 
 
 def _shade_forward(plan: Plan, gbuffer: GBuffer, lights: ViewLights, light_cutoff) -> Image:

@@ -173,5 +173,5 @@ def walk(
 def n_child_tests(node_rows: ArrayLike, short_rows: ArrayLike, n_children: tuple[int, ...], branching: int) -> int:
     """Tests of existing children: a whole node's for each visit, less what the level's last node lacks."""
     rows, short = np.asarray(node_rows, np.int64), np.asarray(short_rows, np.int64)
-    missing = np.array([-count % branching for count in n_children], np.int64)
+    missing = np.array([-count % branching if count else branching for count in n_children], np.int64)
     return int(np.sum(rows * branching - short * missing))

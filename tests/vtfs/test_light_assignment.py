@@ -37,7 +37,7 @@ BATCH = 1024  # small chunks: a chunk's cost does not depend on how much of it i
 def listed_lights(config, inputs):
     """Lights of each cluster, bool `[clusters, lights]`, and each pixel's cluster, after checking the lists."""
     env, _ = run_stages(config, inputs, until="assign")
-    clusters, lists = env["clusters"], env["assign"][0]
+    clusters, lists = env["clusters"], env["assign"]
     n_clusters, n_lights = int(clusters.n_clusters), inputs.n_lights
     offset, count, index = (np.asarray(a) for a in (lists.offset, lists.count, lists.index))
     assert not lists.overflowed and lists.total == count.sum() <= len(index)
