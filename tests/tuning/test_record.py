@@ -2,6 +2,7 @@ import errno
 import json
 import math
 import resource
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -132,24 +133,26 @@ def test_numpy_numbers_are_written_as_numbers(tmp_path):
     assert read.error == 0.5
 
 
-@pytest.fixture
-def full_disk():
-    """Files cannot grow past a size: a write is cut short and the next one fails, as on a full disk."""
+@contextmanager
+def full_disk(n_bytes: int):
+    """Files cannot grow past a size: a write is cut short and the next one fails, as on a full disk.
+
+    Only for as long as the code under test runs: the test runner's own log is a file as well.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
-    def limit(n_bytes: int):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, hard))
 
-    yield limit
-    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-def test_a_full_disk_leaves_the_file_as_it_was(tmp_path, full_disk):
+def test_a_full_disk_leaves_the_file_as_it_was(tmp_path):
     path = tmp_path / "measurements.jsonl"
     append_measurement(path, ONE)
     before = path.read_bytes()
-    full_disk(len(before) + 100)
-    with pytest.raises(InputError, match=r"measurements.jsonl: cannot be written .* free some space"):
+    refused = pytest.raises(InputError, match=r"measurements.jsonl: cannot be written .* free some space")
+    with refused, full_disk(len(before) + 100):
         append_measurement(path, FAILED)
     assert path.read_bytes() == before
 
