@@ -37,7 +37,7 @@ def repeats_ms(
     started = time.perf_counter()
     while True:
         times.append(timed_ms(run))
-        if len(times) < MIN_REPEATS or time.perf_counter() - started < MIN_S:
+        if len(times) < MIN_REPEATS or time.perf_counter() - started < min(MIN_S, cap_s):
             continue
         low, high = median_interval(times)
         middle = (low + high) / 2

@@ -75,7 +75,8 @@ def test_repeats_stop_where_they_are_precise_or_cost_too_much_and_no_earlier(tim
     def done(n):
         low, high = median_interval(times[:n])
         precise = n >= 6 and high - low <= PRECISION * (low + high)
-        return sum(times[:n]) >= MIN_S * 1e3 and (precise or sum(times[:n]) >= cap_s * 1e3)
+        spent_s = sum(times[:n]) / 1e3
+        return spent_s >= min(MIN_S, cap_s) and (precise or spent_s >= cap_s)
 
     assert len(times) >= MIN_REPEATS and done(len(times))
     assert not any(done(n) for n in range(MIN_REPEATS, len(times)))
