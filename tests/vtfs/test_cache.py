@@ -50,9 +50,9 @@ def test_it_is_made_once_and_read_as_it_was(folder):
 
 
 @pytest.mark.parametrize(
-    "other", [("kind", ("one",)), ("kind", ("two", "one")), ("sort", ("one", "two")), ("kind", ())]
+    ("kind", "parts"), [("kind", ("one",)), ("kind", ("two", "one")), ("sort", ("one", "two")), ("kind", ())]
 )
-def test_another_kind_or_part_is_another_thing(folder, other):
+def test_another_kind_or_part_is_another_thing(folder, kind, parts):
     cached("kind", ("one", "two"), Made())
     make = Made({"b": np.ones(2)})
     assert np.array_equal(cached(kind, parts, make)["b"], np.ones(2)) and make.times == 1
