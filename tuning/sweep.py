@@ -163,7 +163,7 @@ def search(
     **Raises:** `InputError` where the record is damaged or cannot be written, where nothing could be timed, and
     where nothing meets `max_error`.
     """
-    run = _Run(workload, Path(record_path), budget, objective, progress, clock)
+    run = _Run(space, workload, Path(record_path), budget, objective, progress, clock)
     hopeful, not_measured = _hopeful(space, run, keep)
 
     design = initial_design(hopeful, run.counts, seed)
@@ -212,6 +212,7 @@ class _Run:
 
     def __init__(
         self,
+        space: Space,
         workload: Workload,
         record_path: Path,
         budget: Budget,
@@ -219,6 +220,7 @@ class _Run:
         progress: Callable[[Progress], None] | None,
         clock: Callable[[], float],
     ):
+        self._space = space
         self._workload = workload
         self._record_path = record_path
         self._budget = budget
@@ -266,7 +268,9 @@ class _Run:
             return True
         if self.measured and self.spent >= share:
             return False
-        best_ms = min((time_ms(m, self.objective) for m in self.measured.values() if is_timed(m)), default=None)
+        # What may not be recommended, as a default that the space leaves out, is not there to be beaten.
+        fastest = self.fastest(c for c in self.measured if c in self._space)
+        best_ms = None if fastest is None else time_ms(self.measured[fastest], self.objective)
         if self._progress is not None:
             self._progress(Progress(candidate, len(self.measured), self.spent, best_ms))
         started = self._clock()

@@ -178,7 +178,7 @@ def _duel(
     times = {role: _timed(m, objective) | {"error": m.error} for role, m in present.items()}
     distinct = list(dict.fromkeys(_config(m) for m in present.values()))
     best_frames = found.best.stages_ms["frame"]
-    slowest = int(np.argmax([np.median(repeats) for repeats in best_frames]))
+    slowest = int(np.argmax([np.median(repeats) if repeats else 0.0 for repeats in best_frames]))
     taken = dict(zip(distinct, workload.duel_ms(distinct, slowest), strict=True))
     best = np.array(taken[_config(found.best)])
     gain: dict[str, Any] = {"frame": workload.frames[slowest], "turns": len(best)}
