@@ -35,7 +35,7 @@ class Sphere(eqx.Module):
 
 
 def sphere_meets_box(sphere: Sphere, box: Aabb) -> Bool[Array, "*pairs"]:
-    """Does a sphere touch a box? Arvo (1990); touching counts, within `SLACK`.
+    """Does a sphere touch a box? Arvo (1990); touching counts, within `SLACK` (and below 1e-18 m: squares underflow).
 
     Shapes broadcast: clusters against lights, or pairs against pairs.
     """

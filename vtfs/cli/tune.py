@@ -1,0 +1,115 @@
+"""`vtfs tune`: the main job."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from vtfs.cli.options import JsonOption, VerboseOption, check_folder, set_log_level, write_json
+from vtfs.cli.scene_arguments import SceneArguments, with_scene
+from vtfs.cli.status import Status
+from vtfs.input_error import InputError
+from vtfs.parameters import PARAMETERS, TECHNIQUES, configuration
+
+
+@with_scene
+def tune(
+    scene: SceneArguments,
+    techniques: Annotated[
+        str | None,
+        typer.Option(help="Comma-separated; default: all that counting finds worth measuring.", metavar="A,B"),
+    ] = None,
+    space: Annotated[Path | None, typer.Option(help="Search space as TOML.", metavar="FILE")] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="Measurements, as 40, or seconds of measuring, as 120s.", show_default="90s")
+    ] = None,
+    objective: Annotated[
+        str, typer.Option(help="`max`: the slowest frame decides; `mean`: the mean of the frames.")
+    ] = "max",
+    max_error: Annotated[
+        float | None,
+        typer.Option(
+            help="Allow settings whose image has at most this error (RMSE over RMS).",
+            show_default="exact settings only",
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the report.", metavar="DIR")] = Path("vtfs-report"),
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the measurements that are in the folder.")
+    ] = False,
+    json_file: JsonOption = None,
+    verbose: VerboseOption = False,
+) -> None:
+    """The main job: count, measure, model, search, report."""
+    set_log_level(verbose)
+    names = _technique_names(techniques)
+    if objective not in ("max", "mean"):
+        raise InputError(f"--objective {objective}: must be max or mean.")
+    if max_error is not None and not max_error >= 0:
+        raise InputError(f"--max-error {max_error}: must be 0 or more.")
+    from tuning.space import load_space
+    from tuning.sweep import Budget
+    from vtfs.device import keep_compiled_programs
+
+    budget_parsed = Budget.parse(budget) if budget is not None else None
+    own_space = load_space(space, names) if space else None
+    # Cheap to check, and dear to find out after minutes of measuring.
+    check_folder(out, resume)
+    setup = scene.set_up()
+    keep_compiled_programs()
+    from reports.page import write_report
+    from tuning.tune import DEFAULT_BUDGET, TuneOptions, tune
+
+    options = TuneOptions(
+        out,
+        names,
+        names if techniques else (),
+        own_space,
+        budget_parsed or DEFAULT_BUDGET,
+        objective,
+        max_error,
+        scene.seed,
+        _command(),  # type: ignore[arg-type]
+    )
+    with Status() as status:
+        result = tune(setup, options, status.say, status.search)
+        status.say("writing the report")
+        page = write_report(out)
+    write_json(json_file, result)
+    if json_file != "-":
+        print(_recommendation(result))
+        print(f"Report: {page}")
+
+
+def _technique_names(given: str | None) -> tuple[str, ...]:
+    if given is None:
+        return tuple(TECHNIQUES)
+    names = tuple(dict.fromkeys(name.strip() for name in given.split(",") if name.strip()))
+    for name in names or ("",):
+        configuration(name)  # refuses what is unknown
+    return names
+
+
+def _command() -> str:
+    return shlex.join(["vtfs", *sys.argv[1:]])
+
+
+def _recommendation(result: dict[str, Any]) -> str:
+    best, gain = result["best"], result["gain"]
+    changed = [f"{name}={value}" for name, value in best["params"].items() if value != PARAMETERS[name].default]
+    low, high = best["time_ms_interval"]
+    lines = [f"{' '.join([best['technique'], *changed])}: {best['time_ms']:.1f} ms a frame ({low:.1f} to {high:.1f})"]
+    for role, words in (("default", "its default"), ("fastest_default", "the fastest default")):
+        if f"over_{role}" in gain:
+            low, high = gain[f"over_{role}_interval"]
+            lines.append(f"  {gain[f'over_{role}']:.2f} times as fast as {words} ({low:.2f} to {high:.2f})")
+    lines.append(f"  {result['claim']}")
+    lines.append(
+        f"  {result['measured']} configurations measured (the space has {result['space_size']}), "
+        f"{result['compiled_programs']} programs compiled, {result['wall_s']:.0f} s: {result['stop_reason']}"
+    )
+    return "\n".join(lines)
