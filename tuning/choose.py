@@ -21,7 +21,9 @@ Objective = Literal["max", "mean"]
 
 Counts = tuple[Mapping[str, int], ...]
 CountsOf = Callable[[Configuration], Counts]
-"""Exact counts of a configuration, one record a measured frame."""
+"""Exact counts of a configuration, one record a measured frame; none where it cannot be counted."""
+
+_HYPERCUBES = 64
 
 SMALLEST_GAIN = 0.01
 """A gain below this is never worth a measurement, however quiet the machine."""
@@ -94,7 +96,7 @@ def initial_design(space: Space, counts_of: CountsOf, seed: int = 0, per_techniq
         spread: list[Configuration] = []
         for candidate in _space_filling(space, technique, seed, per_technique):
             work = work_done(candidate, counts_of(candidate))
-            if work not in seen:
+            if counts_of(candidate) and work not in seen:
                 seen.add(work)
                 spread.append(candidate)
         by_technique.append(spread)
@@ -132,13 +134,14 @@ def choose_next(
     low_ms, high_ms = time_interval_ms(timed[fastest], objective)
     noise = max((high_ms - low_ms) / (2 * 1.96) / best_ms, SMALLEST_GAIN)
 
-    done = {work_done(candidate, counts_of(candidate)) for candidate in measured}
+    # A list, as what turns out not to be countable is added to what was measured.
+    done = {work_done(candidate, counts_of(candidate)) for candidate in list(measured)}
     gains: dict[Configuration, float] = {}
     for technique, model in models.items():
         if not math.isfinite(model.loo_error):
             continue
         open_ = [c for c in space.configurations() if c.technique == technique and c not in measured]
-        open_ = [c for c in open_ if work_done(c, counts_of(c)) not in done]
+        open_ = [c for c in open_ if counts_of(c) and work_done(c, counts_of(c)) not in done]
         predicted_ms = predict_ms(model, [counts_of(candidate) for candidate in open_], objective)
         gains |= zip(open_, _expected_gain(predicted_ms, model.spread, best_ms) / best_ms, strict=True)
 
@@ -219,7 +222,9 @@ def _space_filling(space: Space, technique: str, seed: int, n: int) -> list[Conf
     place = _places(space, technique)
     size = np.array([max(len(ranks) - 1, 1) for ranks in place.values()])
     at = np.array([_ranks(place, candidate) for candidate in candidates]) / size
-    points = qmc.LatinHypercube(d=len(place), rng=np.random.default_rng(seed), optimization="random-cd").random(n)
+    hypercube = qmc.LatinHypercube(d=len(place), rng=np.random.default_rng(seed))
+    # SciPy's own optimisation of one hypercube takes 2 s, and ends no better than the best of these.
+    points = min((hypercube.random(n) for _ in range(_HYPERCUBES)), key=qmc.discrepancy)
     points = points * (1 + 1 / size) - 0.5 / size  # every rank, the first and last too, is the nearest equally often
     chosen: list[Configuration] = []
     for point in points:

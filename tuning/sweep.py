@@ -49,7 +49,7 @@ class Workload(Protocol):
     def frames(self) -> tuple[int, ...]: ...
 
     def counts(self, configuration: Configuration, /) -> tuple[dict[str, int], ...]:
-        """Exact counts, one record a frame, without timing."""
+        """Exact counts, one record a frame, without timing. None where counting fails: measuring then says why."""
         ...
 
     def measure(self, configuration: Configuration, best_ms: float | None, /) -> Measurement:
@@ -163,7 +163,7 @@ def search(
     **Raises:** `InputError` where the record is damaged or cannot be written, where nothing could be timed, and
     where nothing meets `max_error`.
     """
-    run = _Run(space, workload, Path(record_path), budget, objective, progress, clock)
+    run = _Run(space, workload, Path(record_path), budget, objective, max_error, progress, clock)
     hopeful, not_measured = _hopeful(space, run, keep)
 
     design = initial_design(hopeful, run.counts, seed)
@@ -217,6 +217,7 @@ class _Run:
         record_path: Path,
         budget: Budget,
         objective: Objective,
+        max_error: float | None,
         progress: Callable[[Progress], None] | None,
         clock: Callable[[], float],
     ):
@@ -225,6 +226,7 @@ class _Run:
         self._record_path = record_path
         self._budget = budget
         self.objective: Objective = objective
+        self._max_error = max_error
         self._progress = progress
         self._clock = clock
         self._counts: dict[Configuration, Counts] = {}
@@ -255,8 +257,11 @@ class _Run:
         return self._seconds / (self._budget.seconds or math.inf)
 
     def counts(self, candidate: Configuration) -> Counts:
+        """Counts of each frame; what cannot be counted has none, and is a line of the record at once."""
         if candidate not in self._counts:
             self._counts[candidate] = self._workload.counts(candidate)
+            if not self._counts[candidate] and candidate not in self.measured:
+                self._record(candidate, None)
         return self._counts[candidate]
 
     def lighting_computations(self, candidate: Configuration) -> int:
@@ -268,17 +273,27 @@ class _Run:
             return True
         if self.measured and self.spent >= share:
             return False
-        # What may not be recommended, as a default that the space leaves out, is not there to be beaten.
-        fastest = self.fastest(c for c in self.measured if c in self._space)
+        fastest = self.fastest(filter(self._is_allowed, self.measured))
         best_ms = None if fastest is None else time_ms(self.measured[fastest], self.objective)
         if self._progress is not None:
             self._progress(Progress(candidate, len(self.measured), self.spent, best_ms))
+        self._record(candidate, best_ms)
+        return True
+
+    def _record(self, candidate: Configuration, best_ms: float | None) -> None:
         started = self._clock()
         measurement = self._workload.measure(candidate, best_ms)
         self._seconds += self._clock() - started
         append_measurement(self._record_path, measurement)
         self.measured[candidate] = measurement
-        return True
+
+    def _is_allowed(self, candidate: Configuration) -> bool:
+        """May it be recommended? What may not, as a default that the space leaves out, is not there to be beaten."""
+        if self._max_error is None:
+            return candidate in self._space and _is_exact(candidate)
+        error = self.measured[candidate].error
+        known = candidate in self._space or _exact(candidate) in self._space
+        return known and error is not None and error <= self._max_error
 
     def timed(self, candidate: Configuration) -> Measurement | None:
         measurement = self.measured.get(candidate)
@@ -341,12 +356,13 @@ def _hopeful(space: Space, run: _Run, keep: Collection[str]) -> tuple[Space, dic
     unreachable = [name for name in space.techniques if name not in reachable]
     excluded = dict.fromkeys(unreachable, "the constraints leave no configuration of it")
     space = space.limited_to(reachable)
-    work = {name: run.lighting_computations(configuration(name)) for name in space.techniques}
-    least = min(work.values())
+    defaults = {name: configuration(name) for name in space.techniques}
+    work = {name: run.lighting_computations(default) for name, default in defaults.items() if run.counts(default)}
+    least = min(work.values(), default=0)
     reasons = {
         name: f"its default needs {work[name] / least:.0f} times the lighting computations of "
         f"{min(work, key=work.__getitem__)}'s ({work[name]:,} and {least:,})"
-        for name in space.techniques
+        for name in work
         if least > 0 and work[name] > HOPELESS * least and name not in keep
     }
     return space.limited_to(name for name in space.techniques if name not in reasons), excluded | reasons
@@ -395,7 +411,7 @@ def _predictions(
         model = models.get(technique, {}).get("frame")
         if model is None or not math.isfinite(model.loo_error):
             continue
-        candidates = [c for c in space.configurations() if c.technique == technique]
+        candidates = [c for c in space.configurations() if c.technique == technique and run.counts(c)]
         predicted = predict_ms(model, [run.counts(c) for c in candidates], objective)
         for candidate, ms in zip(candidates, map(float, predicted), strict=True):
             measurement = run.timed(candidate)

@@ -126,7 +126,9 @@ def tune(
             }
             for p in found.predictions
         ],
-        "counts": {name: dict(workload.counts(configuration(name))[0]) for name in space.techniques},
+        "counts": {
+            name: dict(counts[0]) for name in space.techniques if (counts := workload.counts(configuration(name)))
+        },
         "stages": _stages(found, options.objective),
         "pictures": pictures,
     }

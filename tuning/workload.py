@@ -87,7 +87,11 @@ class SceneWorkload:
 
     def counts(self, config: Configuration, /) -> tuple[OpCounts, ...]:
         """Counts on the frame with the most work: what decides, and a third of the cost of counting all."""
-        return (self.counts_of_frame(config, 0),)
+        try:
+            return (self.counts_of_frame(config, 0),)
+        except (InputError, MemoryError, jax.errors.JaxRuntimeError) as error:
+            log.info("%s cannot be counted: %s", config, error)
+            return ()
 
     def counts_of_frame(self, config: Configuration, i: int) -> OpCounts:
         # Counting is done once for all batches: they change no list.

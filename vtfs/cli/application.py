@@ -41,6 +41,8 @@ def main() -> None:
         _leave(str(error), 2)
     except _UsageError as error:
         _leave(f"{error.format_message().rstrip('.')}; see vtfs {_command_of(arguments)}--help.", 2)
+    except MemoryError:
+        _leave("this machine's memory is full; try a smaller --size, fewer lights or a smaller scene.", 1)
     except (KeyboardInterrupt, typer.Abort):
         code = _INTERRUPTED
     except BrokenPipeError:
