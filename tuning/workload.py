@@ -37,7 +37,7 @@ from vtfs.frame import (
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
 from vtfs.op_counts import OpCounts
-from vtfs.parameters import Configuration
+from vtfs.parameters import Configuration, configuration
 from vtfs.reference import forward_reference, image_error
 from vtfs.techniques import REGISTRY
 from vtfs.view_samples import ViewSamples
@@ -167,10 +167,12 @@ class SceneWorkload:
         sizes = self._sizes_of(config)
         taken.counts = tuple(self.counts_of_frame(config, i) for i in range(len(self._inputs)))
         started = time.perf_counter()
-        # The frame and its stages are programs of their own: two cores compile them at once.
+        # The frame and its stages are programs of their own: two cores compile them at once. After the default they
+        # are compiled, and the stages are run where the configuration has not lost.
+        new = is_listed(config) and config == configuration(config.technique)
         with ThreadPoolExecutor(2) as pool:
             frame = pool.submit(lambda: jax.block_until_ready(self._run_frame(config, 0)))
-            stages = pool.submit(run_stages, config, self._inputs[0], sizes) if is_listed(config) else None
+            stages = pool.submit(run_stages, config, self._inputs[0], sizes) if new else None
             image, overflowed = frame.result()
             env = stages.result()[0] if stages else {}
         if bool(overflowed):
@@ -203,21 +205,21 @@ class SceneWorkload:
                 # With `mean` every frame counts; with `max` only the slowest one.
                 return self._objective == "max" and (lost or interval_ms[1] < slowest_low)
 
-            run = self._frame_run(config, i)
-            if i:
-                run()
-            frames.append(repeats_ms(run, decided))
+            frames.append(repeats_ms(self._frame_run(config, i), decided))
             slowest_low = max(slowest_low, min(frames[-1]))
+        if all(frames) and is_listed(config):
+            env = env or run_stages(config, self._inputs[0], sizes)[0]
         taken.stages_ms = self._stages_ms(config, sizes, env) | {"frame": tuple(frames)}
         return "timed", ""
 
     def _stages_ms(
         self, config: Configuration, sizes: Sizes, env: dict[str, Any]
     ) -> dict[str, tuple[tuple[float, ...], ...]]:
-        """The stages apart, on the frame with the most work; what `env` holds has been run before."""
-        stages = REGISTRY[config.technique].stages
-        if len(stages) == 1:  # the frame is that stage
-            return {}
+        """The stages apart, on the frame with the most work; what `env` holds has been run before.
+
+        None where `env` is empty: of what has lost, and where the frame is one stage.
+        """
+        stages = REGISTRY[config.technique].stages if env else ()
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:
