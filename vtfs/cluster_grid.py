@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from vtfs.bounds import Aabb
 from vtfs.camera import Camera, Viewport
-from vtfs.gbuffer import RUN, RUN_HEIGHT_PX, RUN_WIDTH_PX, runs_across
+from vtfs.gbuffer import RUN, RUN_HEIGHT_PX, RUN_WIDTH_PX, Positions, runs_across
 from vtfs.input_error import InputError
 
 _BOX_SLACK = 1e-5
@@ -107,17 +107,17 @@ def depth_slices(grid: ClusterGrid, depth_m: Float[Array, "*samples"]) -> Int[Ar
     return jnp.clip(k, 0, grid.depth_slices - 1).astype(jnp.int32)
 
 
-def cell_keys(grid: ClusterGrid, viewport: Viewport, depth_m: Float[Array, "runs 32"]) -> Int[Array, "runs 32"]:
-    """Key `(k * S_y + j) * S_x + i` of the cell of each sample of the image."""
-    run, lane = jnp.arange(depth_m.shape[0], dtype=jnp.int32)[:, None], jnp.arange(RUN, dtype=jnp.int32)[None, :]
-    across = runs_across(viewport)
-    x_px = run % across * RUN_WIDTH_PX + lane % RUN_WIDTH_PX
-    y_px = run // across * RUN_HEIGHT_PX + lane // RUN_WIDTH_PX
+def cell_keys(grid: ClusterGrid, positions: Positions) -> Int[Array, "runs 32"]:
+    """Key `(k * S_y + j) * S_x + i` of the cell of each sample."""
+    viewport, across = positions.viewport, runs_across(positions.viewport)
+    place, lane = positions.place[:, None], jnp.arange(RUN, dtype=jnp.int32)[None, :]
+    x_px = place % across * RUN_WIDTH_PX + lane % RUN_WIDTH_PX
+    y_px = place // across * RUN_HEIGHT_PX + lane // RUN_WIDTH_PX
     columns, rows = grid.tiles(viewport)
     # Padding beyond the image shares the last tiles: it is invalid, but its keys stay in range.
     i = jnp.minimum(x_px // grid.tile_px, columns - 1)
     j = jnp.minimum(y_px // grid.tile_px, rows - 1)
-    return (depth_slices(grid, depth_m) * rows + j) * columns + i
+    return (depth_slices(grid, -positions.z_m) * rows + j) * columns + i
 
 
 def cell_boxes(

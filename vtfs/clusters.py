@@ -53,7 +53,7 @@ def form_clusters(
     - `cells_capacity`: at least the cells of the grid, a multiple of 32.
     - `capacity`: of blocks and clusters.
     """
-    key = jnp.where(positions.valid, cell_keys(grid, positions.viewport, -positions.z_m), -1)
+    key = jnp.where(positions.valid, cell_keys(grid, positions), -1)
     # Bit i of a sample's word: sample i of the same run lies in the same cell. The lowest one leads.
     together = pack_bits(key[:, :, None] == key[:, None, :])[..., 0]
     leader = n_bits_set(~together & (together - jnp.uint32(1)))

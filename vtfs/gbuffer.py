@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from vtfs.camera import Viewport
 
@@ -24,12 +24,16 @@ _DTYPES = {"float32": jnp.float32, "float16": jnp.float16, "bfloat16": jnp.bfloa
 
 
 class Positions(eqx.Module):
-    """Where the view samples are: float32, view space, metres. Padding to whole runs is invalid."""
+    """Where the view samples are: float32, view space, metres. Padding to whole runs is invalid.
+
+    - `place`: which box of 8 x 4 pixels each run covers, counted along the rows of the image.
+    """
 
     x_m: Float[Array, "runs 32"]
     y_m: Float[Array, "runs 32"]
     z_m: Float[Array, "runs 32"]
     valid: Bool[Array, "runs 32"]
+    place: Int[Array, " runs"]
     viewport: Viewport = eqx.field(static=True)
 
 
@@ -67,7 +71,8 @@ def from_runs(runs: np.ndarray, viewport: Viewport) -> np.ndarray:
 def positions_on_device(samples: ViewSamples) -> Positions:
     """Upload where the view samples are."""
     x_m, y_m, z_m = (jax.device_put(to_runs(samples.position_m[..., c])) for c in range(3))
-    return Positions(x_m, y_m, z_m, jax.device_put(to_runs(samples.valid)), samples.camera.viewport)
+    place = jax.device_put(np.arange(x_m.shape[0], dtype=np.int32))
+    return Positions(x_m, y_m, z_m, jax.device_put(to_runs(samples.valid)), place, samples.camera.viewport)
 
 
 def gbuffer_on_device(samples: ViewSamples, positions: Positions, precision: str) -> GBuffer:

@@ -13,12 +13,12 @@ from tests import oracles
 from tests.strategies import SMALL, WIDE, a_camera, cameras, random_samples, seeds
 from vtfs.camera import Viewport
 from vtfs.cluster_grid import cell_boxes, cell_keys, cluster_grid, depth_slices, n_cells
-from vtfs.gbuffer import to_runs
+from vtfs.gbuffer import positions_on_device
 from vtfs.input_error import InputError
 
 some = settings(max_examples=60, deadline=None)
 slices_jit = jax.jit(depth_slices)
-keys_jit, boxes_jit = jax.jit(cell_keys, static_argnums=1), jax.jit(cell_boxes, static_argnums=1)
+keys_jit, boxes_jit = jax.jit(cell_keys), jax.jit(cell_boxes, static_argnums=1)
 tiles = st.integers(2, 256)
 all_slices = st.one_of(st.just(0), st.integers(1, 1024))
 
@@ -92,7 +92,7 @@ def test_keys_name_tiles_and_slices_and_boxes_hold_their_samples(viewport, camer
         raise
     columns, rows = math.ceil(viewport.width_px / tile_px), math.ceil(viewport.height_px / tile_px)
     total = columns * rows * int(grid.depth_slices)
-    key = oracles.as_image(keys_jit(grid, viewport, jnp.asarray(to_runs(depth_m))), viewport)
+    key = oracles.as_image(keys_jit(grid, positions_on_device(samples)), viewport)
     y, x = np.mgrid[: viewport.height_px, : viewport.width_px]
     assert (key % columns == x // tile_px).all() and (key // columns % rows == y // tile_px).all()
     assert (key // (columns * rows) == slices_jit(grid, depth_m)).all() and ((key >= 0) & (key < total)).all()
