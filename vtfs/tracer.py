@@ -1,10 +1,10 @@
-"""Primary rays: the triangle that each pixel sees, found by Embree, and where its ray meets that triangle's plane."""
+"""Primary rays: the triangles that each pixel sees, found by Embree, and where its ray meets their planes."""
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -14,108 +14,176 @@ from vtfs.scene import Scene
 
 log = logging.getLogger("vtfs.view_samples")
 
-_LARGEST_LAYERS = 4096  # alpha-tested surfaces that one ray may step through
+_LARGEST_LAYERS = 4096  # surfaces that one ray may step through
 
 
 class Tracer:
     """A scene in Embree, built once for all frames of a path.
 
-    Embree sees float32 coordinates relative to the centre of the scene. Triangles of `blend` materials are left out:
-    view samples are the opaque layer.
+    Embree sees float32 coordinates relative to the centre of the scene. Triangles of `blend` materials are in a scene
+    of their own: they hide nothing.
     """
 
     def __init__(self, scene: Scene):
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
         self.scene = scene
         low, high = scene.bounds_m
         self._centre_m = (low + high) / 2
-        blended = np.array([material.alpha_mode == "blend" for material in scene.materials])
+        blended = np.array([material.alpha_mode == "blend" for material in scene.materials])[scene.material_index]
         masked = np.array([material.alpha_mode == "mask" for material in scene.materials])
         self._is_masked = masked[scene.material_index]
-        # Embree's primitive numbers count opaque triangles only.
-        self._triangle_of = np.flatnonzero(~blended[scene.material_index]).astype(np.int32)
-        self._embree = EmbreeScene(robust=True)
-        self._is_empty = len(self._triangle_of) == 0
-        if not self._is_empty:
-            vertices = (scene.vertices_m - self._centre_m).astype(np.float32)
-            TriangleMesh(self._embree, vertices, scene.triangles[self._triangle_of])
-            self._embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # the first query builds it
+        vertices = (scene.vertices_m - self._centre_m).astype(np.float32)
+        self._solid = _EmbreeScene(vertices, scene.triangles, np.flatnonzero(~blended))
+        self._blended = _EmbreeScene(vertices, scene.triangles, np.flatnonzero(blended))
+
+    def hit_distances_m(self, origin_m: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Distance to the first solid surface along unit directions; infinite where there is none. float64 `[N]`."""
+        triangle, distance_m = self.first_hits(origin_m, direction)
+        return np.where(triangle >= 0, distance_m.astype(np.float64), np.inf)
+
+    def triangles(self, camera: Camera, planes: Planes | None = None) -> np.ndarray:
+        """The solid triangle that each pixel sees, int32 `[h, w]`, -1 for none.
+
+        Rays start at the near plane, as a rasteriser clips there. `planes`, if the caller has them already.
+        """
+        found = planes or Planes(self.scene, camera)
+        seen = np.full((camera.viewport.height_px, camera.viewport.width_px), -1, np.int32)
+
+        def trace(rows: slice) -> None:
+            rays = _Rays(camera, rows)
+            band = seen[rows].reshape(-1)
+            first, _ = self._first_hits(self._solid, *rays.at(camera.near_m))
+            masked = np.flatnonzero((first >= 0) & self._is_masked[first])
+            band[...] = first
+            band[masked] = -1
+            # Rays that met an alpha-tested surface go on until one passes its test.
+            for ray, triangle, _ in self._march(self._solid, found, rays, masked, np.inf, only_first=True):
+                band[ray] = triangle
+
+        by_bands(camera, trace)
+        return seen
+
+    def all_hits(
+        self, camera: Camera, planes: Planes, until_m: np.ndarray, blended: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Every surface that the rays of pixels meet: the `blend` ones, or the solid ones that pass their alpha test.
+
+        **Arguments:**
+
+        - `until_m`: `[h, w]`, the depth at which each ray ends.
+
+        **Returns:** pixel, triangle and depth of each hit, int64, int32 and float64 `[hits]`; those of a pixel
+        nearest first.
+        """
+        found: dict[int, list[tuple[np.ndarray, ...]]] = {}
+
+        def trace(rows: slice) -> None:
+            rays = _Rays(camera, rows)
+            first_pixel = rows.start * camera.viewport.width_px
+            scene = self._blended if blended else self._solid
+            ends_m = until_m[rows].reshape(-1)
+            hits = self._march(scene, planes, rays, np.arange(len(rays.x)), ends_m, only_first=False)
+            found[rows.start] = [(ray + first_pixel, triangle, depth_m) for ray, triangle, depth_m in hits]
+
+        if (self._blended if blended else self._solid).is_empty:
+            return np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0)
+        by_bands(camera, trace)
+        steps = [step for start in sorted(found) for step in found[start]]
+        pixel, triangle, depth_m = (np.concatenate(column) for column in zip(*steps, strict=True))
+        order = np.argsort(pixel, kind="stable")
+        return pixel[order], triangle[order], depth_m[order]
 
     def first_hits(self, origin_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nearest triangle of each ray, alpha tests not applied.
+        """Nearest solid triangle of each ray, alpha tests not applied.
 
         **Arguments:** world-space float64 `[N, 3]`; directions of any length.
 
         **Returns:** int32 triangle indices, -1 for none, and float32 parameters along the rays.
         """
-        if self._is_empty or len(origin_m) == 0:
+        return self._first_hits(self._solid, origin_m, direction)
+
+    def _first_hits(
+        self, scene: _EmbreeScene, origin_m: np.ndarray, direction: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return scene.first_hits(origin_m - self._centre_m, direction)
+
+    def _march(
+        self,
+        scene: _EmbreeScene,
+        planes: Planes,
+        rays: _Rays,
+        ray: np.ndarray,
+        until_m: np.ndarray | float,
+        only_first: bool,
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Steps of rays from surface to surface: ray, triangle and depth of those that pass their alpha test.
+
+        **Arguments:**
+
+        - `ray`: which of `rays` to follow.
+        - `until_m`: depth at which they end, of all or `[len(rays)]`.
+        - `only_first`: a ray ends at the first surface that passes.
+        """
+        ends_m = np.broadcast_to(until_m, len(rays.x))
+        # The first step past a surface: some float32 roundings of the coordinates that Embree sees.
+        resolution_m = 4 * float(np.finfo(np.float32).eps) * (self.scene.diagonal_m + rays.near_m)
+        past_m, step_m = np.full(len(ray), rays.near_m), np.full(len(ray), resolution_m)
+        last = np.full(len(ray), -1, np.int32)
+        for _ in range(_LARGEST_LAYERS):
+            hit, _ = self._first_hits(scene, *rays.at(past_m, ray))
+            on = np.flatnonzero(hit >= 0)
+            ray, past_m, step_m, last, hit = (values[on] for values in (ray, past_m, step_m, last, hit))
+            if len(ray) == 0:
+                return
+            x, y = rays.x[ray], rays.y[ray]
+            is_again = hit == last  # by rounding: go twice as far as before
+            depth_m = planes.depth_m(hit, x, y)
+            is_over = depth_m > ends_m[ray]
+            is_there = ~is_again & ~is_over & planes.is_opaque(hit, x, y, depth_m)
+            yield ray[is_there], hit[is_there], depth_m[is_there]
+            step_m = np.where(is_again, 2 * step_m, resolution_m)
+            past_m = np.maximum(np.where(is_again, past_m, depth_m), past_m) + step_m
+            on = np.flatnonzero(~is_over & ~is_there if only_first else ~is_over)
+            ray, past_m, step_m, last = (values[on] for values in (ray, past_m, step_m, hit))
+        log.warning("%d rays met more than %d surfaces; the others are not seen", len(ray), _LARGEST_LAYERS)
+
+
+class _EmbreeScene:
+    """Some triangles in Embree, which numbers only those."""
+
+    def __init__(self, vertices: np.ndarray, triangles: np.ndarray, chosen: np.ndarray):
+        self.is_empty = len(chosen) == 0
+        self._triangle_of = chosen.astype(np.int32)
+        if not self.is_empty:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+
+            self._embree = EmbreeScene(robust=True)
+            TriangleMesh(self._embree, vertices, triangles[chosen])
+            self._embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # the first query builds it
+
+    def first_hits(self, origin_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if self.is_empty or len(origin_m) == 0:
             return np.full(len(origin_m), -1, np.int32), np.full(len(origin_m), np.inf, np.float32)
         hits = self._embree.run(
-            np.ascontiguousarray(origin_m - self._centre_m, np.float32),
-            np.ascontiguousarray(direction, np.float32),
-            output=True,
+            np.ascontiguousarray(origin_m, np.float32), np.ascontiguousarray(direction, np.float32), output=True
         )
         primitive = hits["primID"]
         return np.where(primitive >= 0, self._triangle_of[primitive], -1), hits["tfar"]
 
-    def hit_distances_m(self, origin_m: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Distance to the first surface along unit directions; infinite where there is none. float64 `[N]`."""
-        triangle, distance_m = self.first_hits(origin_m, direction)
-        return np.where(triangle >= 0, distance_m.astype(np.float64), np.inf)
 
-    def triangles(self, camera: Camera, planes: Planes | None = None) -> np.ndarray:
-        """The triangle that each pixel sees, int32 `[h, w]`, -1 for none.
+class _Rays:
+    """The rays of some rows of pixels: slopes `x`, `y`, float64 `[N]`; a depth of 1 along each."""
 
-        Rays start at the near plane, as a rasteriser clips there. `planes`, if the caller has them already.
-        """
-        found = planes or Planes(self.scene, camera)
-        seen = np.empty((camera.viewport.height_px, camera.viewport.width_px), np.int32)
+    def __init__(self, camera: Camera, rows: slice):
+        self.near_m = camera.near_m
+        self.x, self.y = pixel_rays(camera, rows)
+        self._right, self._up, self._backward = camera.view_from_world[:3, :3]
+        self._eye_m = np.asarray(camera.eye_m, np.float64)
 
-        def trace(rows: slice) -> None:
-            x, y = pixel_rays(camera, rows)
-            seen[rows] = self._visible(found, camera, x, y).reshape(-1, seen.shape[1])
-
-        by_bands(camera, trace)
-        return seen
-
-    def _visible(self, planes: Planes, camera: Camera, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Triangles on rays of slopes `x`, `y`, float64 `[N]`, alpha tests applied."""
-        right, up, backward = camera.view_from_world[:3, :3]
-        direction = x[:, None] * right + y[:, None] * up - backward
-        eye_m = np.asarray(camera.eye_m, np.float64)
-        triangle, _ = self.first_hits(eye_m + camera.near_m * direction, direction)
-        # Rays that met an alpha-tested surface go on, each from just past it, until none is left.
-        ray = np.flatnonzero(self._is_masked[triangle] & (triangle >= 0))
-        hit, x, y, direction = triangle[ray], x[ray], y[ray], direction[ray]
-        past_m = np.full(len(ray), camera.near_m)
-        # The first step past a surface: some float32 roundings of the coordinates that Embree sees.
-        resolution_m = 4 * float(np.finfo(np.float32).eps) * (self.scene.diagonal_m + camera.near_m)
-        step_m = np.full(len(ray), resolution_m)
-        last = np.full(len(ray), -1, np.int32)
-        for _ in range(_LARGEST_LAYERS):
-            is_again = hit == last  # by rounding: go twice as far as before
-            depth_m = planes.depth_m(hit, x, y)
-            is_there = ~is_again & planes.is_opaque(hit, x, y, depth_m)
-            triangle[ray[is_there]] = hit[is_there]
-            step_m = np.where(is_again, 2 * step_m, resolution_m)
-            past_m = np.maximum(np.where(is_again, past_m, depth_m), past_m) + step_m
-            on = np.flatnonzero(~is_there)
-            ray, x, y, direction, past_m, step_m, last = (
-                values[on] for values in (ray, x, y, direction, past_m, step_m, hit)
-            )
-            hit, _ = self.first_hits(eye_m + past_m[:, None] * direction, direction)
-            triangle[ray[hit < 0]] = -1
-            on = np.flatnonzero(hit >= 0)
-            if len(on) == 0:
-                return triangle
-            ray, x, y, direction, past_m, step_m, last, hit = (
-                values[on] for values in (ray, x, y, direction, past_m, step_m, last, hit)
-            )
-        log.warning("%d rays met more than %d transparent surfaces; they see nothing", len(ray), _LARGEST_LAYERS)
-        triangle[ray] = -1
-        return triangle
+    def at(self, depth_m: np.ndarray | float, ray: np.ndarray | slice = np.s_[:]) -> tuple[np.ndarray, np.ndarray]:
+        """World-space points at a depth on some rays, and the rays' directions: float64 `[N, 3]`."""
+        direction = self.x[ray, None] * self._right + self.y[ray, None] * self._up - self._backward
+        return self._eye_m + np.reshape(depth_m, (-1, 1)) * direction, direction
 
 
 class Planes:

@@ -6,11 +6,12 @@ float64 where the ray meets the plane of that triangle. Only triangle indices ar
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import io
 import logging
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import IO
@@ -21,12 +22,14 @@ from vtfs.cache import cache_dir
 from vtfs.camera import Camera
 from vtfs.files import write_atomically
 from vtfs.input_error import InputError
+from vtfs.layers import Layers, TransparentLayer, hidden_triangles, transparent_triangles
 from vtfs.scene import Material, Scene
 from vtfs.tracer import Planes, Tracer, by_bands, pixel_rays
 
 log = logging.getLogger("vtfs.view_samples")
 
 _VERSION = 1  # of the rule by which a pixel gets its triangle; part of the cache key
+CHANNELS = ("position_m", "normal", "base_colour", "specular", "shininess", "emissive", "triangle", "valid")
 _FLAT = ("specular", "shininess", "triangle", "valid")
 
 
@@ -39,6 +42,7 @@ class ViewSamples:
     - `base_colour`, `emissive`, `specular`, `shininess`: float32, of the material.
     - `triangle`: int32, -1 where nothing was hit.
     - `valid`: there is a surface, and its depth lies in `[near, far]`.
+    - `layers`: transparent surfaces before these, and overdraw; none in a user's own samples.
     """
 
     camera: Camera
@@ -50,15 +54,14 @@ class ViewSamples:
     emissive: np.ndarray
     triangle: np.ndarray
     valid: np.ndarray
+    layers: Layers = field(default_factory=Layers, compare=False, repr=False)
 
     def __post_init__(self):
         height, width = self.camera.viewport.height_px, self.camera.viewport.width_px
-        for field in fields(self)[1:]:
-            shape = (height, width) if field.name in _FLAT else (height, width, 3)
-            if getattr(self, field.name).shape != shape:
-                raise InputError(
-                    f"view samples `{field.name}` has shape {getattr(self, field.name).shape}, not {shape}."
-                )
+        for name in CHANNELS:
+            shape = (height, width) if name in _FLAT else (height, width, 3)
+            if getattr(self, name).shape != shape:
+                raise InputError(f"view samples `{name}` has shape {getattr(self, name).shape}, not {shape}.")
 
     @property
     def n_valid(self) -> int:
@@ -68,8 +71,8 @@ class ViewSamples:
     def key(self) -> str:
         """SHA-256 of the content, in hexadecimal."""
         digest = hashlib.sha256(self.camera.key.encode())
-        for field in fields(self)[1:]:
-            digest.update(np.ascontiguousarray(getattr(self, field.name)).data)
+        for name in CHANNELS:
+            digest.update(np.ascontiguousarray(getattr(self, name)).data)
         return digest.hexdigest()
 
     def world_positions_m(self) -> np.ndarray:
@@ -93,7 +96,34 @@ def trace_view_samples(scene: Scene, camera: Camera, tracer: Tracer | None = Non
             _write_cached(cached, triangle)
         except InputError as error:  # a cache that cannot be written costs time, not the result
             log.warning("view samples are not cached: %s", error)
-    return _samples_from(planes, camera, triangle)
+    samples = _samples_from(planes, camera, triangle)
+    return replace(samples, layers=_layers(scene, samples, tracer))
+
+
+def _layers(scene: Scene, samples: ViewSamples, tracer: Tracer | None) -> Layers:
+    camera, key = samples.camera, _cache_key(scene, samples.camera)
+    any_tracer = functools.cache(lambda: tracer or Tracer(scene))
+    # Planes are 14 numbers a triangle: made again where layers are asked for, and not kept for each frame.
+    made_planes = functools.partial(Planes, scene, camera)
+    opacity = np.array([material.opacity for material in scene.materials], np.float32)
+
+    def transparent() -> tuple[TransparentLayer, ...]:
+        if not any(material.alpha_mode == "blend" for material in scene.materials):
+            return ()
+        until_m = np.where(samples.valid, -samples.position_m[..., 2].astype(np.float64), camera.far_m)
+        planes = made_planes()
+        layers = []
+        for triangle in transparent_triangles(any_tracer, planes, camera, until_m, key):
+            layer = _samples_from(planes, camera, triangle)
+            shares = np.where(layer.valid, opacity[scene.material_index[triangle]].clip(0, 1), 0)
+            layers.append(TransparentLayer(layer, shares.astype(np.float32)))
+        return tuple(layers)
+
+    def hidden() -> tuple[ViewSamples, ...]:
+        planes = made_planes()
+        return tuple(_samples_from(planes, camera, t) for t in hidden_triangles(any_tracer, planes, camera, key))
+
+    return Layers(transparent, hidden)
 
 
 def _samples_from(planes: Planes, camera: Camera, triangle: np.ndarray) -> ViewSamples:
@@ -186,7 +216,7 @@ def save_gbuffer(path: Path | str, samples: ViewSamples) -> None:
 
     **Raises:** `InputError` where the file cannot be written.
     """
-    arrays = {_KEYS.get(field.name, field.name): getattr(samples, field.name) for field in fields(samples)[1:]}
+    arrays = {_KEYS.get(name, name): getattr(samples, name) for name in CHANNELS}
     content = io.BytesIO()
     np.savez(content, **arrays)
     write_atomically(path, content.getvalue())
