@@ -36,6 +36,19 @@ def windows(samples: ViewSamples, lights: Lights) -> np.ndarray:
     return window
 
 
+def layered_image(samples: ViewSamples, lights: Lights, light_cutoff: float = 0.0) -> np.ndarray:
+    """Transparent layers blended over the solid image, one pixel after the other."""
+    total = image(samples, lights, light_cutoff)
+    layers = samples.layers.transparent
+    colours = [image(layer.samples, lights, light_cutoff) for layer in layers]
+    for y, x in np.ndindex(samples.valid.shape):
+        for layer, colour in reversed(list(zip(layers, colours, strict=True))):
+            if layer.samples.valid[y, x]:
+                opacity = float(layer.opacity[y, x])
+                total[y, x] = opacity * colour[y, x] + (1 - opacity) * total[y, x]
+    return total
+
+
 def image(
     samples: ViewSamples, lights: Lights, light_cutoff: float = 0.0, listed: np.ndarray | None = None
 ) -> np.ndarray:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from hypothesis import strategies as st
 
 from tests import oracles
 from vtfs.camera import Camera, Viewport
+from vtfs.layers import Layers, TransparentLayer
 from vtfs.lights import Lights
 from vtfs.view_samples import ViewSamples
 
@@ -86,6 +88,27 @@ def surface_samples(camera: Camera, seed: int, valid_share: float = 0.9) -> View
     y, x = np.mgrid[:height, :width] / max(height, width)
     depth_m = 4 + 3 * np.sin(7 * x + rng.uniform(0, 6)) * np.cos(5 * y) + 10 * (x + y > rng.uniform(0.3, 1.2))
     return samples_at(camera, depth_m, rng.random((height, width)) < valid_share, rng)
+
+
+def layered_samples(camera: Camera, seed: int, n_layers: int = 3) -> ViewSamples:
+    """Solid surfaces with sparse transparent layers before them, and hidden fragments behind."""
+    rng = np.random.default_rng(seed)
+    solid = surface_samples(camera, seed)
+    shape = solid.valid.shape
+    depth_m = -solid.position_m[..., 2]
+
+    def layer(share: float) -> ViewSamples:
+        # Only the left part, so that some runs have no sample and some tiles no layer.
+        valid = (rng.random(shape) < 0.5) & (np.arange(shape[1]) < 0.7 * shape[1])
+        return samples_at(camera, depth_m * share, valid, rng)
+
+    nearest_first = [layer(share) for share in np.sort(rng.uniform(0.3, 0.95, n_layers))]
+    transparent = tuple(
+        TransparentLayer(samples, np.where(samples.valid, rng.random(shape), 0).astype(np.float32))
+        for samples in nearest_first
+    )
+    hidden = tuple(layer(share) for share in rng.uniform(1.05, 3, 2))
+    return replace(solid, layers=Layers(lambda: transparent, lambda: hidden))
 
 
 def samples_in_slices(

@@ -148,7 +148,7 @@ class SceneWorkload:
 
     def valid(self) -> np.ndarray:
         """Which pixels of that frame have a sample."""
-        return self._path.samples[0].valid
+        return self._inputs[0].seen()
 
     def list_lengths(self, config: Configuration) -> np.ndarray:
         """Lights listed for each pixel of that frame."""
@@ -177,7 +177,7 @@ class SceneWorkload:
             env = stages.result()[0] if stages else {}
         if bool(overflowed):
             return "overflow", "a frame no longer fits the capacities that its sizing run found"
-        valid = self._path.samples[0].valid
+        valid = self._inputs[0].seen()
         with np.errstate(invalid="ignore", over="ignore"):  # of an image that overflowed the error is infinite
             taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), self.reference(), valid)
         exact = config["gbuffer"] == "float32" and config["light_cutoff"] == 0
@@ -219,7 +219,7 @@ class SceneWorkload:
 
         None where `env` is empty: of what has lost, and where the frame is one stage.
         """
-        stages = REGISTRY[config.technique].stages if env else ()
+        stages = REGISTRY[config.technique].stages_of(self._inputs[0].has_transparent) if env else ()
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:
@@ -245,11 +245,15 @@ class SceneWorkload:
         return sizes
 
     def _run_frame(self, config: Configuration, i: int):
-        program = frame_program(config.technique, planned(config, self._sizes_of(config)))
+        program = frame_program(
+            config.technique, planned(config, self._sizes_of(config)), self._inputs[i].has_transparent
+        )
         return program(self._inputs[i].environment(config))
 
     def _frame_run(self, config: Configuration, i: int) -> Callable[[], object]:
-        program = frame_program(config.technique, planned(config, self._sizes_of(config)))
+        program = frame_program(
+            config.technique, planned(config, self._sizes_of(config)), self._inputs[i].has_transparent
+        )
         env = self._inputs[i].environment(config)
 
         def run() -> None:

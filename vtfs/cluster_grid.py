@@ -89,6 +89,21 @@ def n_cells(grid: ClusterGrid, viewport: Viewport) -> int:
     return int(columns) * int(rows) * int(grid.depth_slices)
 
 
+def grid_cells(grid: ClusterGrid, viewport: Viewport) -> Int[Array, ""]:
+    """The same, on the device."""
+    columns, rows = grid.tiles(viewport)
+    return columns * rows * grid.depth_slices
+
+
+def tile_pixels(grid: ClusterGrid, viewport: Viewport, key: Int[Array, "*cells"]) -> Int[Array, "*cells"]:
+    """Pixels of each cell's tile: fewer where the image ends."""
+    columns, rows = grid.tiles(viewport)
+    i, j = key % columns, key // columns % rows
+    width_px = jnp.minimum(grid.tile_px, viewport.width_px - i * grid.tile_px)
+    height_px = jnp.minimum(grid.tile_px, viewport.height_px - j * grid.tile_px)
+    return width_px * height_px
+
+
 def depth_slices(grid: ClusterGrid, depth_m: Float[Array, "*samples"]) -> Int[Array, "*samples"]:
     """Depth slice of each view sample.
 

@@ -5,23 +5,27 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import jax
 import numpy as np
 
 from vtfs.cluster_grid import cluster_grid, n_cells
-from vtfs.clusters import Clusters
-from vtfs.gbuffer import GBuffer, from_runs, gbuffer_on_device, positions_on_device
+from vtfs.gbuffer import RUN_WIDTH_PX, Fragments, GBuffer, LayerTable, Positions, from_runs
 from vtfs.input_error import InputError
 from vtfs.light_lists import view_lights
 from vtfs.lights import Lights
 from vtfs.op_counts import (
     ListLengths,
     OpCounts,
+    added,
     assign_counts,
     batch_counts,
     cluster_counts,
+    gbuffer_traffic,
+    light_volume_batch_counts,
+    light_volume_lengths,
     list_lengths,
     memory_counts,
     shading_counts,
@@ -29,7 +33,7 @@ from vtfs.op_counts import (
     walk_rows,
 )
 from vtfs.parameters import PARAMETERS, Configuration
-from vtfs.techniques import REGISTRY, Plan, Stage, walk_chunk
+from vtfs.techniques import REGISTRY, Plan, Stage, volume_chunk, walk_chunk
 from vtfs.view_samples import ViewSamples
 
 _BRUTE_FORCE_WORD = 32
@@ -84,30 +88,61 @@ class FrameInputs:
     def __init__(self, samples: ViewSamples, lights: Lights):
         self.samples = samples
         self.camera = samples.camera
-        self.positions = positions_on_device(samples)
+        self.viewport = samples.camera.viewport
         self.lights = view_lights(lights, samples.camera)
         self.n_lights = lights.n_lights
         depths = -samples.position_m[..., 2][samples.valid]
         self.deepest_m = float(depths.max(initial=samples.camera.near_m))
-        self._gbuffers: dict[str, GBuffer] = {}
+        self._fragments: dict[bool, Fragments] = {}
+        self._positions: dict[bool, Positions] = {}
+        self._gbuffers: dict[tuple[bool, str], GBuffer] = {}
 
-    def gbuffer(self, precision: str) -> GBuffer:
-        if precision not in self._gbuffers:
-            self._gbuffers[precision] = gbuffer_on_device(self.samples, self.positions, precision)
-        return self._gbuffers[precision]
+    @cached_property
+    def layers(self) -> LayerTable:
+        return self.fragments(with_hidden=False).layer_table()
+
+    @property
+    def has_transparent(self) -> bool:
+        return bool(self.fragments(with_hidden=False).n_transparent_runs)
+
+    def fragments(self, with_hidden: bool) -> Fragments:
+        if with_hidden not in self._fragments:
+            self._fragments[with_hidden] = Fragments(self.samples, with_hidden=with_hidden)
+        return self._fragments[with_hidden]
+
+    def positions(self, with_hidden: bool) -> Positions:
+        if with_hidden not in self._positions:
+            self._positions[with_hidden] = self.fragments(with_hidden).positions()
+        return self._positions[with_hidden]
+
+    def gbuffer(self, precision: str, with_hidden: bool) -> GBuffer:
+        key = with_hidden, precision
+        if key not in self._gbuffers:
+            self._gbuffers[key] = self.fragments(with_hidden).gbuffer(self.positions(with_hidden), precision)
+        return self._gbuffers[key]
+
+    def seen(self) -> np.ndarray:
+        """Which pixels show anything: bool `[h, w]`."""
+        layers = [layer.samples.valid for layer in self.samples.layers.transparent]
+        return np.logical_or.reduce([self.samples.valid, *layers])
 
     def environment(self, config: Configuration) -> dict[str, Any]:
         """What the stages of a configuration start from, by the names that `Stage.needs` uses."""
         params = config.params
+        technique = REGISTRY[config.technique]
+        with_hidden = technique.shades_hidden(config)
         env: dict[str, Any] = {
-            "positions": self.positions,
-            "gbuffer": self.gbuffer(str(params["gbuffer"])),
+            "positions": self.positions(with_hidden),
+            "gbuffer": self.gbuffer(str(params["gbuffer"]), with_hidden),
+            "layers": self.layers,
             "lights": self.lights,
             "light_cutoff": np.float32(params["light_cutoff"]),
         }
-        if "tile_px" in params:
-            slices = 1 if REGISTRY[config.technique].one_slice else int(params["depth_slices"])
+        if technique.lists == "clusters":
+            slices = 1 if technique.one_slice else int(params["depth_slices"])
             env["grid"] = cluster_grid(self.camera, int(params["tile_px"]), slices, self.deepest_m)
+        elif technique.lists == "light_volumes":  # for its pixels
+            env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
         return env
 
 
@@ -136,18 +171,21 @@ def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
         env[stage] = result
 
 
-@functools.cache
-def frame_program(technique: str, plan: Plan) -> Callable[..., Any]:
+def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable[..., Any]:
     """All stages fused in one program: from the inputs to the image and whether anything overflowed."""
-    stages = REGISTRY[technique].stages
+    return _fused(REGISTRY[technique].stages_of(has_transparent), plan)
 
+
+@functools.cache
+def _fused(stages: tuple[Stage, ...], plan: Plan) -> Callable[..., Any]:
+    # By stages, not by name: techniques that differ in what is rasterised share a program here.
     def run(env: dict[str, Any]):
         env = dict(env)
         for stage in stages:
             keep_result(env, stage.name, stage.run(plan, *(env[name] for name in stage.needs)))
         overflowed = [env["clusters"].overflowed] if "clusters" in env else []
         overflowed += [env["assign"].overflowed] if "assign" in env else []
-        return env["shade_opaque"], jax.numpy.stack(overflowed).any() if overflowed else np.bool_(False)
+        return env[stages[-1].name], jax.numpy.stack(overflowed).any() if overflowed else np.bool_(False)
 
     return jax.jit(run)
 
@@ -167,11 +205,14 @@ def run_stages(
     **Raises:** `CapacityError`, and `InputError` for a grid with too many cells.
     """
     env = inputs.environment(config)
-    n_runs = inputs.positions.z_m.shape[0]
-    grid_cells = n_cells(env["grid"], inputs.positions.viewport) if "grid" in env else 0
+    technique = REGISTRY[config.technique]
+    n_runs = env["positions"].z_m.shape[0]
+    grid_cells = n_cells(env["grid"], inputs.viewport) if technique.lists == "clusters" else 0
+    if technique.two_lists and inputs.has_transparent:
+        grid_cells *= 2
     fitting = Sizes(rounded_up("cells", grid_cells), rounded_up("blocks", n_runs), rounded_up("pairs", 0))
     sizes = fitting.covering(sizes) if sizes else fitting
-    for stage in REGISTRY[config.technique].stages:
+    for stage in technique.stages_of(inputs.has_transparent):
         while True:
             plan = narrowed(stage, planned(config, sizes))
             result = stage_program(stage, plan)(*(env[name] for name in stage.needs))
@@ -189,12 +230,14 @@ def run_stages(
     return env, sizes
 
 
-def lengths_of(env: dict[str, Any], inputs: FrameInputs) -> ListLengths:
+def lengths_of(config: Configuration, env: dict[str, Any], inputs: FrameInputs) -> ListLengths:
     """The list lengths of a frame that `run_stages` ran up to its lists."""
-    if "assign" not in env:
-        return uniform_lengths(env["gbuffer"], inputs.n_lights)
-    clusters: Clusters = env["clusters"]
-    return list_lengths(env["gbuffer"], clusters, env["assign"])
+    lists = REGISTRY[config.technique].lists
+    if lists == "clusters":
+        return list_lengths(env["positions"], env["clusters"], env["assign"])
+    if lists == "light_volumes":
+        return light_volume_lengths(env["positions"], env["assign"], inputs.n_lights)
+    return uniform_lengths(env["positions"], inputs.n_lights)
 
 
 @dataclass(frozen=True)
@@ -202,12 +245,15 @@ class FrameCounts:
     """Exact counts of one frame.
 
     - `technique`: what the technique does, whatever the `batch`; see `op_counts`.
-    - `of_block`, `walk_rows`: what `at_batch` needs.
+    - `of_block`: lengths of the blocks' lists, the `n_solid_blocks` of solid samples first; `walk_rows`,
+      `light_runs`: what `at_batch` needs besides.
     """
 
     technique: OpCounts
     of_block: np.ndarray
+    n_solid_blocks: int
     walk_rows: tuple[int, ...]
+    light_runs: int
     branching: int
     sizes: Sizes
 
@@ -215,7 +261,10 @@ class FrameCounts:
         """All counts, with those of this implementation's chunks."""
         chunk = walk_chunk(batch, self.branching, self.sizes.pairs)
         capacity = self.sizes.blocks or len(self.of_block)
-        return self.technique | batch_counts(self.of_block, self.walk_rows, batch, capacity, chunk)
+        own = batch_counts(self.of_block, self.n_solid_blocks, self.walk_rows, batch, capacity, chunk)
+        if self.light_runs:
+            own = added(own, light_volume_batch_counts(self.light_runs, volume_chunk(self.sizes.pairs, batch)))
+        return self.technique | own
 
     def as_arrays(self) -> dict[str, np.ndarray]:
         """For a cache; the inverse of `from_arrays`."""
@@ -224,49 +273,61 @@ class FrameCounts:
             "names": np.array(list(self.technique)),
             "counts": np.array(list(self.technique.values()), np.int64),
             "of_block": self.of_block,
+            "scalars": np.array([self.n_solid_blocks, self.light_runs, self.branching, *sizes], np.int64),
             "walk_rows": np.array(self.walk_rows, np.int64),
-            "branching": np.array(self.branching),
-            "sizes": np.array(sizes, np.int64),
         }
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> FrameCounts:
         technique = {str(name): int(value) for name, value in zip(arrays["names"], arrays["counts"], strict=True)}
         walk_rows = tuple(int(rows) for rows in arrays["walk_rows"])
-        sizes = Sizes(*(int(size) for size in arrays["sizes"]))
-        return cls(technique, arrays["of_block"], walk_rows, int(arrays["branching"]), sizes)
+        n_solid_blocks, light_runs, branching, *sizes = (int(value) for value in arrays["scalars"])
+        return cls(technique, arrays["of_block"], n_solid_blocks, walk_rows, light_runs, branching, Sizes(*sizes))
 
 
 def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None) -> tuple[FrameCounts, ListLengths]:
     """Count what a configuration does on a frame; nothing is shaded."""
+    technique = REGISTRY[config.technique]
     if is_listed(config):
         env, sizes = run_stages(config, inputs, sizes, until="assign")
     else:
         env, sizes = inputs.environment(config), NO_SIZES
-    lengths = lengths_of(env, inputs)
+    lengths = lengths_of(config, env, inputs)
     branching = int(config.params.get("branching", _BRUTE_FORCE_WORD))
     tile_px = int(config.params.get("tile_px", PARAMETERS["tile_px"].default))
-    n_samples = inputs.samples.n_valid
-    counts = shading_counts(lengths, n_samples, tile_px)
+    fragments = inputs.fragments(technique.shades_hidden(config))
+    counts = shading_counts(lengths, fragments.n_samples, fragments.n_transparent_samples, tile_px)
+    counts |= {"hidden_fragments": fragments.n_samples - inputs.fragments(with_hidden=False).n_samples}
     rows: tuple[int, ...] = ()
-    if is_listed(config):
-        counts |= cluster_counts(lengths, n_cells(env["grid"], inputs.positions.viewport), inputs.n_lights)
+    light_runs = 0
+    if technique.lists == "clusters":
+        counts |= cluster_counts(lengths, n_cells(env["grid"], inputs.viewport), inputs.n_lights)
         counts |= assign_counts(env["assign_counts"], inputs.n_lights, branching)
         rows = walk_rows(env["assign_counts"])
-    structures = [value for name, value in env.items() if name not in ("positions", "gbuffer", "grid", "light_cutoff")]
-    counts |= memory_counts(env["gbuffer"], structures, n_samples, counts.get("light_cluster_pairs", 0))
-    return FrameCounts(counts, lengths.of_block, rows, branching, sizes), lengths
+        if technique.one_slice:
+            counts["lighting_computations_tile_area"] = counts["light_cluster_pairs"] * tile_px**2
+    elif technique.lists == "light_volumes":
+        light_runs = int(env["assign"].total)
+        n_tests = inputs.n_lights * inputs.positions(with_hidden=False).n_visible_runs
+        counts |= {"lights": inputs.n_lights, "leaf_tests": n_tests, "light_runs": light_runs}
+    given = ("positions", "gbuffer", "grid", "light_cutoff")
+    structures = [value for name, value in env.items() if name not in given]
+    counts |= memory_counts(env["gbuffer"], structures, fragments.n_samples, counts.get("light_cluster_pairs", 0))
+    counts |= gbuffer_traffic(technique.reads_gbuffer, counts)
+    frame_counts = FrameCounts(counts, lengths.of_block, lengths.n_solid_blocks, rows, light_runs, branching, sizes)
+    return frame_counts, lengths
 
 
 def is_listed(config: Configuration) -> bool:
-    """Does the technique make light lists?"""
-    return any(stage.name == "assign" for stage in REGISTRY[config.technique].stages)
+    """Does the technique make lists, of lights or of pixels?"""
+    return REGISTRY[config.technique].lists != "none"
 
 
 def render(config: Configuration, inputs: FrameInputs) -> np.ndarray:
     """The image of a configuration by its fused program: linear, float32 `[h, w, 3]`, 0 where invalid."""
     sizes = run_stages(config, inputs, until="assign")[1] if is_listed(config) else NO_SIZES
-    image, overflowed = frame_program(config.technique, planned(config, sizes))(inputs.environment(config))
+    program = frame_program(config.technique, planned(config, sizes), inputs.has_transparent)
+    image, overflowed = program(inputs.environment(config))
     if bool(overflowed):
         raise CapacityError(f"{config}: the frame no longer fits the capacities that its sizing run found.")
     return image_on_host(image, inputs)
@@ -274,5 +335,4 @@ def render(config: Configuration, inputs: FrameInputs) -> np.ndarray:
 
 def image_on_host(image: tuple[Any, ...], inputs: FrameInputs) -> np.ndarray:
     """`[h, w, 3]` from the device's runs."""
-    viewport = inputs.positions.viewport
-    return np.stack([from_runs(np.asarray(channel), viewport) for channel in image], axis=-1)
+    return np.stack([from_runs(np.asarray(channel), inputs.viewport) for channel in image], axis=-1)

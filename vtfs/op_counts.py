@@ -8,8 +8,9 @@ import jax
 import numpy as np
 
 from vtfs.clusters import Clusters
-from vtfs.gbuffer import RUN, GBuffer, from_runs
+from vtfs.gbuffer import RUN, GBuffer, Positions, from_runs
 from vtfs.light_lists import AssignCounts, LightLists
+from vtfs.light_volumes import LightPixels, lights_of_samples
 from vtfs.shading import chunk_work
 from vtfs.wide_tree import inner_level_nodes, n_child_tests, n_leaf_nodes
 
@@ -22,50 +23,80 @@ OpCounts = dict[str, int]
 class ListLengths:
     """Lists of one frame on the host.
 
-    - `of_sample`: `[h, w]`, lights in the list of each valid sample; 0 where invalid.
+    - `of_sample`: `[h, w]`, lights in the lists of all shaded samples of a pixel, transparent and hidden ones too.
+    - `of_visible`: of the visible solid sample alone.
     - `of_cluster`: of each occupied cluster.
-    - `of_block`: of each block, see `Clusters`.
+    - `of_block`: of each block, see `Clusters`; the `n_solid_blocks` of solid samples first.
     """
 
     of_sample: np.ndarray
+    of_visible: np.ndarray
     of_cluster: np.ndarray
     of_block: np.ndarray
+    n_solid_blocks: int
 
 
-def list_lengths(gbuffer: GBuffer, clusters: Clusters, lists: LightLists) -> ListLengths:
+def list_lengths(positions: Positions, clusters: Clusters, lists: LightLists) -> ListLengths:
     """Bring the lengths of a frame's lists to the host."""
     n_blocks, n_clusters = int(clusters.n_blocks), int(clusters.n_clusters)
     of_cluster = np.asarray(lists.count)[:n_clusters].astype(np.int64)
     of_block = of_cluster[np.asarray(clusters.block_cluster)[:n_blocks]]
-    valid = np.asarray(gbuffer.positions.valid)
+    valid = np.asarray(positions.valid)
     block = np.where(valid, np.asarray(clusters.block_of_sample), 0)
     of_run = np.where(valid, of_block[block] if n_blocks else 0, 0)
-    return ListLengths(from_runs(of_run, gbuffer.positions.viewport), of_cluster, of_block)
+    return _lengths(of_run, positions, of_cluster, of_block, int(clusters.n_solid_blocks))
 
 
-def uniform_lengths(gbuffer: GBuffer, n_lights: int) -> ListLengths:
+def uniform_lengths(positions: Positions, n_lights: int) -> ListLengths:
     """What `forward` has: every sample's list holds every light."""
-    valid = np.asarray(gbuffer.positions.valid)
-    of_sample = from_runs(np.where(valid, n_lights, 0), gbuffer.positions.viewport).astype(np.int64)
-    return ListLengths(of_sample, np.array([n_lights]), np.full(len(valid), n_lights, np.int64))
+    valid = np.asarray(positions.valid)
+    of_run = np.where(valid, n_lights, 0).astype(np.int64)
+    of_block = np.full(len(valid), n_lights, np.int64)
+    return _lengths(of_run, positions, np.array([n_lights]), of_block, positions.n_solid_runs)
 
 
-def shading_counts(lengths: ListLengths, n_samples: int, tile_px: int) -> OpCounts:
+def light_volume_lengths(positions: Positions, pixels: LightPixels, n_lights: int) -> ListLengths:
+    """What deferred shading has: the lights that cover each pixel; transparent samples take every light."""
+    valid = np.asarray(positions.valid)
+    of_run = np.where(valid, n_lights, 0).astype(np.int64)
+    of_run[: positions.n_visible_runs] = np.asarray(lights_of_samples(pixels, positions.n_visible_runs))
+    of_block = np.full(positions.n_transparent_runs, n_lights, np.int64)
+    return _lengths(of_run, positions, np.empty(0, np.int64), of_block, 0)
+
+
+def _lengths(
+    of_run: np.ndarray, positions: Positions, of_cluster: np.ndarray, of_block: np.ndarray, n_solid_blocks: int
+) -> ListLengths:
+    n_visible = positions.n_visible_runs
+    total = of_run[:n_visible].astype(np.int64)
+    np.add.at(total, np.asarray(positions.place)[n_visible:], of_run[n_visible:])
+    of_sample, of_visible = (from_runs(runs, positions.viewport) for runs in (total, of_run[:n_visible]))
+    return ListLengths(of_sample, of_visible, of_cluster, of_block, n_solid_blocks)
+
+
+def shading_counts(lengths: ListLengths, n_samples: int, n_transparent_samples: int, tile_px: int) -> OpCounts:
     """Counts of shading that the technique has, whoever implements it.
 
+    - `samples`: all that are shaded, the `transparent_samples` too.
     - `lighting_computations`: valid samples times their list's length.
-    - `divergence`: over runs of 32 samples in tile order, 32 times the longest list: what warps pay.
+    - `divergence`: over runs of 32 visible solid samples in tile order, 32 times the longest list: what warps pay.
     """
     return {
         "samples": n_samples,
+        "transparent_samples": n_transparent_samples,
         "lighting_computations": int(lengths.of_sample.sum(dtype=np.int64)),
-        "divergence": _divergence(lengths.of_sample, tile_px),
+        "divergence": _divergence(lengths.of_visible, tile_px),
         "shading_blocks": len(lengths.of_block),
     }
 
 
 def batch_counts(
-    of_block: np.ndarray, walk_rows: tuple[int, ...], batch: int, capacity: int, walk_chunk: int
+    of_block: np.ndarray,
+    n_solid_blocks: int,
+    walk_rows: tuple[int, ...],
+    batch: int,
+    capacity: int,
+    walk_chunk: int,
 ) -> OpCounts:
     """What this implementation pays for its chunks.
 
@@ -74,15 +105,38 @@ def batch_counts(
 
     **Arguments:**
 
-    - `of_block`: list lengths; `walk_rows`: pairs on each level, see `AssignCounts`.
+    - `of_block`: list lengths, those of solid samples first; `walk_rows`: pairs on each level, see `AssignCounts`.
     - `capacity`: of the blocks; `walk_chunk`: pairs tested at once.
     """
-    lanes, steps = chunk_work(of_block, batch, capacity)
+    lanes = steps = 0
+    for part in (of_block[:n_solid_blocks], of_block[n_solid_blocks:]):
+        if len(part):
+            own_lanes, own_steps = chunk_work(part, batch, capacity)
+            lanes, steps = lanes + own_lanes, steps + own_steps
     return {
         "shading_lanes": lanes,
         "shading_steps": steps,
         "assign_steps": sum(-(-rows // walk_chunk) for rows in walk_rows),
     }
+
+
+def light_volume_batch_counts(light_runs: int, chunk: int) -> OpCounts:
+    """What deferred shading pays for its chunks of (light, run) pairs."""
+    steps = -(-light_runs // chunk)
+    return {"shading_lanes": steps * chunk * RUN, "shading_steps": steps}
+
+
+def added(a: OpCounts, b: OpCounts) -> OpCounts:
+    """Sums of the counts of both."""
+    return {name: a.get(name, 0) + b.get(name, 0) for name in dict.fromkeys((*a, *b))}
+
+
+def gbuffer_traffic(reads: str, counts: OpCounts) -> OpCounts:
+    """Bytes through a G-buffer of four buffers with four channels of 16 or 32 bits and 32-bit depth: written once for
+    each solid sample, and read for each sample or each lighting computation (Olsson and Assarsson 2011)."""
+    n_solid = counts["samples"] - counts["transparent_samples"]
+    accesses = {"never": 0, "per_sample": 2 * n_solid, "per_light": n_solid + counts["lighting_computations"]}[reads]
+    return {"bytes_gbuffer_16": 36 * accesses, "bytes_gbuffer_32": 68 * accesses}
 
 
 def _divergence(of_sample: np.ndarray, tile_px: int) -> int:

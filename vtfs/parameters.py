@@ -78,6 +78,12 @@ PARAMETERS: dict[str, Parameter] = {
             "0: all at once (on a CPU: what fits its cache)",
             choices=_BATCHES,
         ),
+        Parameter(
+            "prepass",
+            "on",
+            "depth pre-pass: without one, fragments are shaded that end up hidden",
+            choices=("on", "off"),
+        ),
         Parameter("bounds", "implicit", "what stands for the samples of a cell", choices=("implicit", "explicit")),
         Parameter(
             "gbuffer",
@@ -89,10 +95,19 @@ PARAMETERS: dict[str, Parameter] = {
     )
 }
 
+_SHADING = ("batch", "gbuffer", "light_cutoff")
+
 TECHNIQUES: dict[str, tuple[str, ...]] = {
-    "forward": ("batch", "gbuffer", "light_cutoff"),
-    "tiled_deferred": ("tile_px", "batch", "gbuffer", "light_cutoff"),
-    "volume_tiled_bvh": ("tile_px", "depth_slices", "branching", "batch", "bounds", "gbuffer", "light_cutoff"),
+    "forward": ("prepass", *_SHADING),
+    "deferred": _SHADING,
+    "deferred_stencil": _SHADING,
+    "tiled_forward": ("tile_px", *_SHADING),
+    "tiled_forward_prez": ("tile_px", *_SHADING),
+    "tiled_deferred": ("tile_px", *_SHADING),
+    "clustered_deferred": ("tile_px", "depth_slices", "branching", "bounds", *_SHADING),
+    "clustered_forward": ("tile_px", "depth_slices", "branching", "bounds", *_SHADING),
+    "volume_tiled": ("tile_px", "depth_slices", *_SHADING),
+    "volume_tiled_bvh": ("tile_px", "depth_slices", "branching", "bounds", *_SHADING),
 }
 """Techniques and the parameters each one has, in the order in which they are shown."""
 

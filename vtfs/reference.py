@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from vtfs.layers import composite
 from vtfs.lights import Lights
 from vtfs.view_samples import ViewSamples
 
@@ -14,7 +15,14 @@ _MIN_DISTANCE2_M2 = 1e-4
 
 
 def forward_reference(samples: ViewSamples, lights: Lights) -> np.ndarray:
-    """The image of `forward` in float64 `[h, w, 3]`; 0 where invalid.
+    """The image of `forward` in float64 `[h, w, 3]`, transparent layers blended over it; 0 where nothing is seen."""
+    layers = samples.layers.transparent
+    blended = tuple((_reference(layer.samples, lights), layer.opacity.astype(np.float64)) for layer in layers)
+    return composite(_reference(samples, lights), blended)
+
+
+def _reference(samples: ViewSamples, lights: Lights) -> np.ndarray:
+    """One layer.
 
     A light is left out of a box of 32 x 32 pixels only where the box of their positions lies outside its
     range, where its window is exactly 0; so the sum is that over all lights.

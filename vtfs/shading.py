@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from vtfs.clusters import Clusters
 from vtfs.fast_power import power
-from vtfs.gbuffer import RUN, GBuffer
+from vtfs.gbuffer import RUN, GBuffer, LayerTable
 from vtfs.light_lists import POINT_COLUMNS, LightLists
 
 MIN_DISTANCE2_M2 = 1e-4
@@ -35,6 +35,13 @@ def direction_to_eye(position_m: tuple[Float[Array, "*s"], ...]) -> tuple[Float[
     x_m, y_m, z_m = position_m
     inverse = -jax.lax.rsqrt(x_m * x_m + y_m * y_m + z_m * z_m + _TINY)
     return x_m * inverse, y_m * inverse, z_m * inverse
+
+
+def surface_of(part: GBuffer) -> Surface:
+    """What is lit, in the precision of the channels."""
+    position_m = (part.positions.x_m, part.positions.y_m, part.positions.z_m)
+    to_eye = direction_to_eye(position_m)
+    return Surface(position_m, to_eye, part.normal, part.base_colour, part.specular, part.shininess)
 
 
 def reflected(
@@ -125,8 +132,11 @@ def chunk_work(of_block: np.ndarray, batch: int, capacity: int) -> tuple[int, in
     return lanes, steps
 
 
-def longest_first(count: Int[Array, " blocks"], n_blocks: Int[Array, ""]) -> Int[Array, " blocks"]:
-    """Blocks in order of the lengths of their lists, so that a chunk's lists are about equally long.
+def longest_first(
+    count: Int[Array, " blocks"], first_block: Int[Array, ""], end_block: Int[Array, ""]
+) -> Int[Array, " blocks"]:
+    """Blocks of `[first_block, end_block)` in order of the lengths of their lists, so that a chunk's lists are about
+    equally long; then the others.
 
     Length and block are packed in one word: XLA on a CPU sorts pairs six times slower. Very long lists
     count as equal.
@@ -136,7 +146,8 @@ def longest_first(count: Int[Array, " blocks"], n_blocks: Int[Array, ""]) -> Int
     longest = (1 << (32 - block_bits)) - 2
     block = jnp.arange(capacity, dtype=jnp.uint32)
     shortness = longest - jnp.minimum(count, longest).astype(jnp.uint32)
-    shortness = jnp.where(block < n_blocks.astype(jnp.uint32), shortness, jnp.uint32(longest + 1))
+    is_shaded = (block >= first_block.astype(jnp.uint32)) & (block < end_block.astype(jnp.uint32))
+    shortness = jnp.where(is_shaded, shortness, jnp.uint32(longest + 1))
     word: UInt32[Array, " blocks"] = jnp.sort((shortness << block_bits) | block)
     return (word & jnp.uint32((1 << block_bits) - 1)).astype(jnp.int32)
 
@@ -148,25 +159,32 @@ def shade(
     light_rows: Float[Array, "lights columns"],
     light_cutoff: Float[Array, ""],
     batch: int,
+    transparent: bool = False,
 ) -> Image:
     """Shade every valid sample with its cluster's lights: linear red, green and blue, 0 where invalid.
 
     Blocks are shaded in chunks, those with the longest lists first. A step adds one light to every block of
     the chunk; steps go on with the first quarter once the others are done, and so on.
+
+    **Arguments:**
+
+    - `transparent`: shade the transparent runs, and return those; else the solid ones, and return the visible.
     """
     capacity = clusters.block_run.shape[0]
     chunk = chunk_blocks(capacity, batch)
     block_count = lists.count[clusters.block_cluster]
     block_offset = lists.offset[clusters.block_cluster]
     # Padded, so that the last chunk's slice is not moved.
-    order = jnp.pad(longest_first(block_count, clusters.n_blocks), (0, chunk - 1))
+    first_block = clusters.n_solid_blocks if transparent else jnp.int32(0)
+    end_block = clusters.n_blocks if transparent else clusters.n_solid_blocks
+    n_blocks = jnp.minimum(end_block - first_block, capacity)
+    order = jnp.pad(longest_first(block_count, first_block, end_block), (0, chunk - 1))
     widths = _step_widths(chunk, capacity)
 
     def add_lights(part, offset, count, k, sums, width, until):
         """Steps `k` to `until` of the first `width` blocks."""
         part, offset, count = jax.tree.map(lambda channel: channel[:width], (part, offset, count))
-        position_m = (part.positions.x_m, part.positions.y_m, part.positions.z_m)
-        to_eye = direction_to_eye(position_m)
+        surface = surface_of(part)
 
         def step(state):
             k, sums = state
@@ -177,15 +195,8 @@ def shade(
         def add_light(k, sums):
             light = light_rows[lists.index[offset + k]][:, None, :]
             # Narrow channels are widened here and not before the loop: they are read at every step.
-            surface = Surface(
-                position_m,
-                to_eye,
-                tuple(n.astype(jnp.float32) for n in part.normal),
-                tuple(c.astype(jnp.float32) for c in part.base_colour),
-                part.specular.astype(jnp.float32),
-                part.shininess.astype(jnp.float32),
-            )
-            added = reflected(surface, light, light_cutoff, (k < count)[:, None])
+            widened = jax.tree.map(lambda channel: channel.astype(jnp.float32), surface)
+            added = reflected(widened, light, light_cutoff, (k < count)[:, None])
             return k + 1, tuple(s + a for s, a in zip(sums, added, strict=True))
 
         first_sums = tuple(s[:width] for s in sums)
@@ -195,7 +206,7 @@ def shade(
     def shade_chunk(state):
         first, image = state
         block = jax.lax.dynamic_slice(order, (first,), (chunk,))
-        in_use = first + jnp.arange(chunk, dtype=jnp.int32) < clusters.n_blocks
+        in_use = first + jnp.arange(chunk, dtype=jnp.int32) < n_blocks
         run = clusters.block_run[block]
         offset, count = block_offset[block], jnp.where(in_use, block_count[block], 0)
         part = jax.tree.map(lambda channel: channel[run], gbuffer)
@@ -211,9 +222,25 @@ def shade(
         return first + chunk, image
 
     blank = tuple(jnp.zeros((capacity + chunk - 1, RUN), jnp.float32) for _ in range(3))
-    _, image = jax.lax.while_loop(
-        lambda state: state[0] < jnp.minimum(clusters.n_blocks, capacity), shade_chunk, (jnp.int32(0), blank)
-    )
+    _, image = jax.lax.while_loop(lambda state: state[0] < n_blocks, shade_chunk, (jnp.int32(0), blank))
+    positions = gbuffer.positions
+    runs = np.s_[positions.n_solid_runs :] if transparent else np.s_[: positions.n_visible_runs]
     place = jnp.zeros(capacity, jnp.int32).at[order[:capacity]].set(jnp.arange(capacity, dtype=jnp.int32))
-    pixel = place[clusters.block_of_sample] * RUN + jnp.arange(RUN, dtype=jnp.int32)
-    return tuple(jnp.where(gbuffer.positions.valid, channel.reshape(-1)[pixel], 0) for channel in image)
+    pixel = place[clusters.block_of_sample[runs]] * RUN + jnp.arange(RUN, dtype=jnp.int32)
+    return tuple(jnp.where(positions.valid[runs], channel.reshape(-1)[pixel], 0) for channel in image)
+
+
+def blend_layers(solid: Image, colour: Image, layers: LayerTable) -> Image:
+    """Blend transparent layers over the solid image, farthest first.
+
+    **Arguments:** `solid` of the visible runs, `colour` of the transparent runs.
+    """
+
+    def blend(i, image):
+        run = layers.run[layers.run.shape[0] - 1 - i]
+        opacity = jnp.where((run >= 0)[:, None], layers.opacity[jnp.maximum(run, 0)], 0)
+        return tuple(
+            opacity * c[jnp.maximum(run, 0)] + (1 - opacity) * behind for c, behind in zip(colour, image, strict=True)
+        )
+
+    return jax.lax.fori_loop(0, layers.run.shape[0], blend, solid)

@@ -5,16 +5,17 @@ A technique is a row here and a row of `parameters.TECHNIQUES`.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
 from vtfs.cluster_grid import ClusterGrid
 from vtfs.clusters import Bounds, Clusters, everything, form_clusters
-from vtfs.gbuffer import GBuffer, Positions
+from vtfs.gbuffer import GBuffer, LayerTable, Positions
 from vtfs.light_assignment.brute_force import assign_brute_force
 from vtfs.light_assignment.light_tree import (
     LightTree,
@@ -24,9 +25,10 @@ from vtfs.light_assignment.light_tree import (
     sort_lights,
 )
 from vtfs.light_lists import AssignCounts, LightLists, ViewLights
+from vtfs.light_volumes import LightPixels, draw_light_volumes, shade_light_volumes
 from vtfs.morton import morton_codes
 from vtfs.parameters import Configuration
-from vtfs.shading import Image, shade
+from vtfs.shading import Image, blend_layers, chunk_blocks, shade
 
 _TESTS_AT_ONCE = {"cpu": 2**19, "gpu": 2**22}
 """`batch = 0` means all queries at once, as far as their rows of boxes stay in the cache of a CPU (12 MB) or leave
@@ -37,10 +39,12 @@ the memory of a GPU to others (100 MB)."""
 class Plan:
     """What is static in a frame's programs: it fixes array shapes. A stage sees only what it names.
 
+    - `two_lists`: transparent samples have lists of their own.
     - `cells`, `blocks`, `pairs`: rounded capacities (see `frame.Sizes`).
     """
 
     bounds: Bounds = "implicit"
+    two_lists: bool = False
     branching: int = 0
     batch: int = 0
     cells: int = 0
@@ -52,7 +56,7 @@ class Plan:
 class Stage:
     """One step of a frame, timed apart.
 
-    - `needs`: inputs (`positions`, `gbuffer`, `grid`, `lights`, `light_cutoff`) and earlier stages.
+    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `lights`, `light_cutoff`) and earlier stages.
     - `statics`: the fields of `Plan` that its program depends on.
     """
 
@@ -62,34 +66,55 @@ class Stage:
     statics: tuple[str, ...] = ()
 
 
+Lists = Literal["clusters", "light_volumes", "none"]
+
+
 @dataclass(frozen=True)
 class Technique:
     """How a frame is made.
 
+    - `lists`: what its assignment makes: lists of lights for clusters, pixels for lights, or nothing.
     - `one_slice`: cells are whole tiles, whatever the depth.
     - `bounds`: what stands for the samples of a cell where the configuration does not say.
+    - `two_lists`: transparent samples have lists of their own.
+    - `without_prepass`: fragments that end up hidden are shaded too; `forward` has a parameter for that.
+    - `reads_gbuffer`: bytes go through a G-buffer: once for each sample, or once for each light on it.
     """
 
     name: str
     stages: tuple[Stage, ...]
+    lists: Lists = "clusters"
     one_slice: bool = False
     bounds: Bounds = "implicit"
+    two_lists: bool = False
+    without_prepass: bool = False
+    reads_gbuffer: Literal["never", "per_sample", "per_light"] = "never"
 
     def plan(self, config: Configuration) -> Plan:
         """The static part of a configuration, without capacities."""
         params = config.params
         return Plan(
             bounds=params.get("bounds", self.bounds),  # type: ignore[arg-type]
+            two_lists=self.two_lists,
             branching=int(params.get("branching", 0)),
             batch=int(params.get("batch", 0)),
         )
+
+    def shades_hidden(self, config: Configuration) -> bool:
+        """Are fragments shaded that end up hidden?"""
+        return config.params.get("prepass", "off" if self.without_prepass else "on") == "off"
+
+    def stages_of(self, has_transparent: bool) -> tuple[Stage, ...]:
+        """The stages of a frame; that of transparent samples only where there are any."""
+        return tuple(stage for stage in self.stages if has_transparent or stage.name != "shade_transparent")
 
 
 Assigned = tuple[LightLists, AssignCounts]
 
 
 def _clusters(plan: Plan, positions: Positions, grid: ClusterGrid) -> Clusters:
-    return form_clusters(positions, grid, plan.bounds, plan.cells, plan.blocks)
+    two_lists = plan.two_lists and positions.n_transparent_runs > 0
+    return form_clusters(positions, grid, plan.bounds, plan.cells, plan.blocks, two_lists)
 
 
 _MAX_TESTS_AT_ONCE = 2**24  # their boxes take 400 MB
@@ -127,15 +152,56 @@ def _build_tree(plan: Plan, lights: ViewLights, light_cutoff, order) -> LightTre
     return build_light_tree(lights.spheres(light_cutoff), order, plan.branching)
 
 
+def _draw_volumes(stencil: bool, plan: Plan, positions: Positions, grid: ClusterGrid, lights: ViewLights, light_cutoff):
+    chunk = walk_chunk(plan.batch, 32, plan.pairs)
+    spheres = lights.spheres(light_cutoff)
+    return draw_light_volumes(spheres, positions, grid, stencil, plan.pairs, chunk), None
+
+
+def _shade_volumes(plan: Plan, gbuffer: GBuffer, lights: ViewLights, light_cutoff, pixels: LightPixels) -> Image:
+    chunk = volume_chunk(pixels.light.shape[0], plan.batch)
+    return shade_light_volumes(gbuffer, pixels, lights.row, light_cutoff, chunk)
+
+
+_MAX_VOLUME_RUNS = 2**16  # runs whose G-buffer is gathered at once: 100 MB
+
+
+def volume_chunk(pairs: int, batch: int) -> int:
+    """(light, run) pairs shaded at once."""
+    return min(chunk_blocks(pairs, batch), _MAX_VOLUME_RUNS)
+
+
 def _shade(
     plan: Plan, gbuffer: GBuffer, lights: ViewLights, light_cutoff, clusters: Clusters, lists: LightLists
 ) -> Image:
     return shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch)
 
 
+def _shade_transparent(
+    plan: Plan,
+    gbuffer: GBuffer,
+    layers: LayerTable,
+    lights: ViewLights,
+    light_cutoff,
+    solid: Image,
+    clusters: Clusters,
+    lists: LightLists,
+) -> Image:
+    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, transparent=True)
+    return blend_layers(solid, colour, layers)
+
+
 def _shade_forward(plan: Plan, gbuffer: GBuffer, lights: ViewLights, light_cutoff) -> Image:
     clusters = everything(gbuffer.positions)
-    return shade(gbuffer, clusters, _all_lights(lights, clusters), lights.row, light_cutoff, plan.batch)
+    return _shade(plan, gbuffer, lights, light_cutoff, clusters, _all_lights(lights, clusters))
+
+
+def _shade_transparent_forward(
+    plan: Plan, gbuffer: GBuffer, layers: LayerTable, lights: ViewLights, light_cutoff, solid: Image
+) -> Image:
+    clusters = everything(gbuffer.positions)
+    lists = _all_lights(lights, clusters)
+    return _shade_transparent(plan, gbuffer, layers, lights, light_cutoff, solid, clusters, lists)
 
 
 def _all_lights(lights: ViewLights, clusters: Clusters) -> LightLists:
@@ -144,36 +210,66 @@ def _all_lights(lights: ViewLights, clusters: Clusters) -> LightLists:
     return LightLists(zeros, zeros + n_lights, jnp.arange(n_lights), jnp.int32(n_lights), jnp.bool_(False))
 
 
-_CLUSTERS = Stage("clusters", _clusters, ("positions", "grid"), ("bounds", "cells", "blocks"))
-_SHADE = Stage("shade_opaque", _shade, ("gbuffer", "lights", "light_cutoff", "clusters", "assign"), ("batch",))
+_CLUSTERS = Stage("clusters", _clusters, ("positions", "grid"), ("bounds", "two_lists", "cells", "blocks"))
+_ASSIGN_BRUTE_FORCE = Stage("assign", _assign_brute_force, ("lights", "light_cutoff", "clusters"), ("batch", "pairs"))
+_ASSIGN_BY_TREE = (
+    Stage("reduce", _reduce, ("lights", "light_cutoff")),
+    Stage("morton", _morton, ("lights", "light_cutoff", "reduce")),
+    Stage("sort", _sort, ("morton",)),
+    Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",)),
+    Stage("assign", _assign_tree, ("build_tree", "clusters"), ("branching", "batch", "pairs")),
+)
+_LIGHTS = ("lights", "light_cutoff")
+_SHADE = (
+    Stage("shade_opaque", _shade, ("gbuffer", *_LIGHTS, "clusters", "assign"), ("batch",)),
+    Stage(
+        "shade_transparent",
+        _shade_transparent,
+        ("gbuffer", "layers", *_LIGHTS, "shade_opaque", "clusters", "assign"),
+        ("batch",),
+    ),
+)
+_SHADE_TRANSPARENT_FORWARD = Stage(
+    "shade_transparent", _shade_transparent_forward, ("gbuffer", "layers", *_LIGHTS, "shade_opaque"), ("batch",)
+)
+
+
+def _deferred(name: str, stencil: bool) -> Technique:
+    draw = functools.partial(_draw_volumes, stencil)
+    stages = (
+        Stage("assign", draw, ("positions", "grid", *_LIGHTS), ("batch", "pairs")),
+        Stage("shade_opaque", _shade_volumes, ("gbuffer", *_LIGHTS, "assign"), ("batch",)),
+        _SHADE_TRANSPARENT_FORWARD,
+    )
+    return Technique(name, stages, lists="light_volumes", reads_gbuffer="per_light")
+
+
+_TILED = (_CLUSTERS, _ASSIGN_BRUTE_FORCE, *_SHADE)
+_CLUSTERED = (_CLUSTERS, *_ASSIGN_BY_TREE, *_SHADE)
 
 REGISTRY: dict[str, Technique] = {
     technique.name: technique
     for technique in (
         Technique(
-            "forward", (Stage("shade_opaque", _shade_forward, ("gbuffer", "lights", "light_cutoff"), ("batch",)),)
+            "forward",
+            (Stage("shade_opaque", _shade_forward, ("gbuffer", *_LIGHTS), ("batch",)), _SHADE_TRANSPARENT_FORWARD),
+            lists="none",
         ),
+        _deferred("deferred", stencil=False),
+        _deferred("deferred_stencil", stencil=True),
+        Technique("tiled_forward", _TILED, one_slice=True, without_prepass=True),
+        Technique("tiled_forward_prez", _TILED, one_slice=True, bounds="depth_range", two_lists=True),
         Technique(
             "tiled_deferred",
-            (
-                _CLUSTERS,
-                Stage("assign", _assign_brute_force, ("lights", "light_cutoff", "clusters"), ("batch", "pairs")),
-                _SHADE,
-            ),
+            _TILED,
             one_slice=True,
             bounds="depth_range",
+            two_lists=True,
+            reads_gbuffer="per_sample",
         ),
-        Technique(
-            "volume_tiled_bvh",
-            (
-                _CLUSTERS,
-                Stage("reduce", _reduce, ("lights", "light_cutoff")),
-                Stage("morton", _morton, ("lights", "light_cutoff", "reduce")),
-                Stage("sort", _sort, ("morton",)),
-                Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",)),
-                Stage("assign", _assign_tree, ("build_tree", "clusters"), ("branching", "batch", "pairs")),
-                _SHADE,
-            ),
-        ),
+        Technique("clustered_deferred", _CLUSTERED, reads_gbuffer="per_sample"),
+        Technique("clustered_forward", _CLUSTERED),
+        Technique("volume_tiled", _TILED),
+        Technique("volume_tiled_bvh", _CLUSTERED),
     )
 }

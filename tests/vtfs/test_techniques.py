@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import oracles
-from tests.strategies import SMALL, WIDE, a_camera, nearby_lights, no_lights, seeds, surface_samples
+from tests.strategies import SMALL, WIDE, a_camera, layered_samples, nearby_lights, no_lights, seeds, surface_samples
 from vtfs.frame import FrameInputs, image_on_host, render, run_stages
 from vtfs.parameters import TECHNIQUES, configuration
 from vtfs.reference import forward_reference, largest_relative_difference
@@ -20,18 +20,22 @@ BATCH = 1024  # a walk with small chunks takes little time on a small image
 
 
 def a_config(technique, **params):
-    narrow = {"branching": 8} if technique == "volume_tiled_bvh" else {}
+    narrow = {"branching": 8} if "branching" in TECHNIQUES[technique] else {}
     return configuration(technique, {"batch": BATCH, **narrow, **params})
 
 
 def check(config, samples, lights, *, light_cutoff=0.0):
-    image = render(config, FrameInputs(samples, lights))
-    expected = oracles.image(samples, lights, float(np.float32(light_cutoff)))
+    inputs = FrameInputs(samples, lights)
+    image, seen = render(config, inputs), inputs.seen()
+    expected = oracles.layered_image(samples, lights, float(np.float32(light_cutoff)))
     # Rounding decides whether a light counts where its window is the cut-off.
-    sure = samples.valid & ~oracles.near_cutoff(samples, lights, light_cutoff, 1e-5)
-    assert sure.sum() > 0.5 * samples.valid.sum()
+    unsure = oracles.near_cutoff(samples, lights, light_cutoff, 1e-5)
+    for layer in samples.layers.transparent:
+        unsure |= oracles.near_cutoff(layer.samples, lights, light_cutoff, 1e-5)
+    sure = seen & ~unsure
+    assert sure.sum() > 0.4 * seen.sum()
     assert largest_relative_difference(image, expected, sure) < 1e-4
-    assert image.dtype == np.float32 and (image[~samples.valid] == 0).all()
+    assert image.dtype == np.float32 and (image[~seen] == 0).all()
     return image
 
 
@@ -46,6 +50,15 @@ def test_images_are_those_of_the_float64_loop(technique, viewport, n_lights, spo
     samples = surface_samples(a_camera(viewport), seed)
     lights = nearby_lights(samples, n_lights, seed, spots)
     check(a_config(technique, light_cutoff=light_cutoff), samples, lights, light_cutoff=light_cutoff)
+
+
+@pytest.mark.parametrize("technique", TECHNIQUES)
+@given(seed=seeds)
+@few
+def test_transparent_layers_are_blended_as_pixel_by_pixel(technique, seed):
+    samples = layered_samples(a_camera(), seed)
+    lights = nearby_lights(samples, 37, seed)
+    check(a_config(technique), samples, lights)
 
 
 @given(
@@ -87,10 +100,10 @@ def test_a_batch_changes_the_image_by_no_more_than_the_order_of_adding(technique
 
 @pytest.mark.parametrize("technique", TECHNIQUES)
 def test_stages_by_themselves_make_the_image_of_the_frame(technique):
-    samples = surface_samples(a_camera(), 4)
+    samples = layered_samples(a_camera(), 4)
     inputs = FrameInputs(samples, nearby_lights(samples, 37, 4))
     env, _ = run_stages(a_config(technique), inputs)
-    by_stages = image_on_host(env["shade_opaque"], inputs).astype(np.float64)
+    by_stages = image_on_host(env["shade_transparent"], inputs).astype(np.float64)
     assert largest_relative_difference(render(a_config(technique), inputs), by_stages, samples.valid) < 1e-6
 
 
@@ -125,8 +138,8 @@ def test_odd_lights_make_no_image_that_is_not_a_number(technique):
 def test_the_registry_and_the_parameters_name_the_same_techniques():
     assert tuple(REGISTRY) == tuple(TECHNIQUES)
     for name, technique in REGISTRY.items():
-        assert technique.name == name and technique.stages[-1].name == "shade_opaque"
-        known = {"positions", "gbuffer", "grid", "lights", "light_cutoff"}
+        assert technique.name == name and technique.stages[-1].name == "shade_transparent"
+        known = {"positions", "gbuffer", "layers", "grid", "lights", "light_cutoff"}
         for stage in technique.stages:
             assert set(stage.needs) <= known
             known.add(stage.name)

@@ -50,7 +50,7 @@ def render(
             inputs = FrameInputs(setup.samples(number), setup.lights)
             image = render_frame(config, inputs)
             _, lengths = count_frame(config, inputs)
-        valid = inputs.samples.valid
+        valid = inputs.seen()
         largest = int(lengths.of_sample.max(initial=0))
         paths = [out / f"{kind}_{technique}_{number:04d}.png" for kind in ("image", "heat")]
         write_png(paths[0], tone_map(image, exposure(image, valid)))
