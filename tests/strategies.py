@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from tests import oracles
 from vtfs.camera import Camera, Viewport
+from vtfs.gbuffer import Fragments, GBuffer, Positions
 from vtfs.layers import Layers, TransparentLayer
 from vtfs.lights import Lights
 from vtfs.view_samples import ViewSamples
@@ -95,7 +96,7 @@ def layered_samples(camera: Camera, seed: int, n_layers: int = 3) -> ViewSamples
     rng = np.random.default_rng(seed)
     solid = surface_samples(camera, seed)
     shape = solid.valid.shape
-    depth_m = -solid.position_m[..., 2]
+    depth_m = np.where(solid.valid, -solid.position_m[..., 2], 5.0)
 
     def layer(share: float) -> ViewSamples:
         # Only the left part, so that some runs have no sample and some tiles no layer.
@@ -109,6 +110,14 @@ def layered_samples(camera: Camera, seed: int, n_layers: int = 3) -> ViewSamples
     )
     hidden = tuple(layer(share) for share in rng.uniform(1.05, 3, 2))
     return replace(solid, layers=Layers(lambda: transparent, lambda: hidden))
+
+
+def positions_of(samples: ViewSamples, with_hidden: bool = False) -> Positions:
+    return Fragments(samples, with_hidden=with_hidden).positions()
+
+
+def gbuffer_of(samples: ViewSamples, precision: str = "float32") -> GBuffer:
+    return Fragments(samples, with_hidden=False).gbuffer(positions_of(samples), precision)
 
 
 def samples_in_slices(

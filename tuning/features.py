@@ -20,6 +20,7 @@ STAGE_TERMS: dict[str, tuple[str, ...]] = {
     "assign": ("clusters_occupied", "light_cluster_pairs", "tree_tests", "leaf_tests", "assign_steps"),
     # Lanes are the lighting computations that the SIMD loop really runs, those that divergence wastes included.
     "shade_opaque": ("samples", "lighting_computations", "shading_lanes", "shading_steps"),
+    "shade_transparent": ("transparent_samples", "lighting_computations", "shading_lanes", "shading_steps"),
     "frame": (
         "samples",
         "cells_total",

@@ -42,6 +42,15 @@ def heat_map(counts: np.ndarray, largest: int, valid: np.ndarray) -> np.ndarray:
     return np.round(np.where(valid[..., None], colour, 0)).astype(np.uint8)
 
 
+def random_colours(labels: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """One colour a label `[h, w]`, neighbours told apart; the same label has the same colour in every picture."""
+    # Multiplicative hashing (Knuth 1998, Sec. 6.4): the golden ratio of 2^32 spreads consecutive labels.
+    hashed = labels.astype(np.uint32) * np.uint32(2654435761)
+    channels = [(hashed >> np.uint32(shift)) & np.uint32(255) for shift in (24, 16, 8)]
+    colour = 64 + np.stack(channels, axis=-1) * 0.75  # none is so dark that it looks like nothing
+    return np.where(valid[..., None], colour, 0).astype(np.uint8)
+
+
 def write_png(path: Path | str, pixels: np.ndarray) -> None:
     """Bytes `[h, w, 3]` as a PNG file."""
     from PIL import Image

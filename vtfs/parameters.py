@@ -111,6 +111,11 @@ TECHNIQUES: dict[str, tuple[str, ...]] = {
 }
 """Techniques and the parameters each one has, in the order in which they are shown."""
 
+TUNED_TECHNIQUES = ("forward", "tiled_deferred", "volume_tiled_bvh")
+"""What a search compares unless the user says otherwise. Nothing is rasterised here, so that techniques which differ
+in their passes over the geometry run the same programs: `tiled_forward_prez` those of `tiled_deferred`,
+`clustered_forward` and `clustered_deferred` those of `volume_tiled_bvh`."""
+
 
 @dataclass(frozen=True)
 class Configuration:

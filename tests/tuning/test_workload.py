@@ -18,7 +18,7 @@ from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_cou
 from vtfs.camera import Viewport
 from vtfs.device import keep_compiled_programs
 from vtfs.frame import FrameInputs, count
-from vtfs.parameters import TECHNIQUES, configuration
+from vtfs.parameters import TECHNIQUES, TUNED_TECHNIQUES, configuration
 from vtfs.scene_setup import SceneOptions, set_up
 
 FRAMES = (0, 30, 45)
@@ -112,7 +112,7 @@ def test_the_frames_of_a_scene_are_those_that_counting_says(setup):
 # Measuring
 
 
-@pytest.mark.parametrize("technique", TECHNIQUES)
+@pytest.mark.parametrize("technique", (*TUNED_TECHNIQUES, "deferred_stencil"))
 def test_a_measurement_has_times_of_every_frame_and_stage(workload, technique):
     with short_repeats():
         m = workload.measure(configuration(technique), None)

@@ -15,7 +15,7 @@ from tests.command_line import ROOT, SMALL, STREET, Ran, finished, full_disk, is
 from vtfs.camera import Viewport, load_cameras, save_cameras
 from vtfs.frame import FrameInputs, count
 from vtfs.gallery import GALLERY, build_scene
-from vtfs.parameters import PARAMETERS, TECHNIQUES, configuration
+from vtfs.parameters import PARAMETERS, TECHNIQUES, TUNED_TECHNIQUES, configuration
 from vtfs.scene import save_scene
 from vtfs.scene_setup import SceneOptions, set_up
 
@@ -160,7 +160,7 @@ def test_a_space_without_a_file_prints_a_record_a_configuration():
 # render
 
 
-@pytest.mark.parametrize("technique", TECHNIQUES)
+@pytest.mark.parametrize("technique", TUNED_TECHNIQUES)
 def test_render_writes_an_image_and_a_heat_map(technique):
     ran = vtfs("render", *SMALL, "--technique", technique, "--out", "new/pictures ü", "--frame", "5", "--json", "-")
     assert ran.code == 0 and ran.err == ""
@@ -174,7 +174,7 @@ def test_render_writes_an_image_and_a_heat_map(technique):
             )
 
 
-@pytest.mark.parametrize("technique", TECHNIQUES)
+@pytest.mark.parametrize("technique", TUNED_TECHNIQUES)
 def test_a_camera_that_sees_nothing(technique):
     away = CAMERA | {"frames": [{"eye": [1e3, 1, 0], "target": [2e3, 1, 0], "up": [0, 1, 0]}]}
     write("away.json", json.dumps(away))

@@ -10,10 +10,9 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from tests import oracles
-from tests.strategies import SMALL, WIDE, a_camera, cameras, random_samples, seeds
+from tests.strategies import SMALL, WIDE, a_camera, cameras, positions_of, random_samples, seeds
 from vtfs.camera import Viewport
 from vtfs.cluster_grid import cell_boxes, cell_keys, cluster_grid, depth_slices, n_cells
-from vtfs.gbuffer import positions_on_device
 from vtfs.input_error import InputError
 
 some = settings(max_examples=60, deadline=None)
@@ -92,7 +91,7 @@ def test_keys_name_tiles_and_slices_and_boxes_hold_their_samples(viewport, camer
         raise
     columns, rows = math.ceil(viewport.width_px / tile_px), math.ceil(viewport.height_px / tile_px)
     total = columns * rows * int(grid.depth_slices)
-    key = oracles.as_image(keys_jit(grid, positions_on_device(samples)), viewport)
+    key = oracles.as_image(keys_jit(grid, positions_of(samples)), viewport)
     y, x = np.mgrid[: viewport.height_px, : viewport.width_px]
     assert (key % columns == x // tile_px).all() and (key // columns % rows == y // tile_px).all()
     assert (key // (columns * rows) == slices_jit(grid, depth_m)).all() and ((key >= 0) & (key < total)).all()

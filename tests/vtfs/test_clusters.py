@@ -7,10 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import oracles
-from tests.strategies import SMALL, WIDE, samples_in_slices, seeds
+from tests.strategies import SMALL, WIDE, positions_of, samples_in_slices, seeds
 from vtfs.cluster_grid import cluster_grid
 from vtfs.clusters import everything, form_clusters
-from vtfs.gbuffer import positions_on_device
 
 some = settings(max_examples=8, deadline=None)
 CELLS, CAPACITY = 2**15, 2**12
@@ -30,7 +29,7 @@ form = jax.jit(form_clusters, static_argnums=(2, 3, 4))
 def test_clusters_are_the_cells_that_hold_samples(viewport, bounds, tile_px, n_slices, seed, valid_share):
     samples, slices = samples_in_slices(viewport, n_slices, seed, valid_share)
     grid = cluster_grid(samples.camera, tile_px, n_slices, 0.0)
-    clusters = form(positions_on_device(samples), grid, bounds, CELLS, CAPACITY)
+    clusters = form(positions_of(samples), grid, bounds, CELLS, CAPACITY)
     cells = oracles.cells(samples, tile_px, slices)
     columns, rows = -(-viewport.width_px // tile_px), -(-viewport.height_px // tile_px)
     keys = sorted((k * rows + j) * columns + i for k, j, i in cells)
@@ -72,7 +71,7 @@ def clusters_run(clusters):
 
 def test_blocks_that_do_not_fit_say_so():
     samples, _ = samples_in_slices(SMALL, 24, 0)
-    grid, positions = cluster_grid(samples.camera, 2, 24, 0.0), positions_on_device(samples)
+    grid, positions = cluster_grid(samples.camera, 2, 24, 0.0), positions_of(samples)
     needed = int(form(positions, grid, "implicit", CELLS, CAPACITY).n_blocks)
     for capacity, overflows in ((needed - 1, True), (needed, False)):
         clusters = form(positions, grid, "implicit", CELLS, capacity)
@@ -81,6 +80,6 @@ def test_blocks_that_do_not_fit_say_so():
 
 def test_everything_is_one_cluster_of_all_runs():
     samples, _ = samples_in_slices(WIDE, 24, 0)
-    clusters = everything(positions_on_device(samples))
+    clusters = everything(positions_of(samples))
     assert int(clusters.n_clusters) == 1 and int(clusters.n_blocks) == 8 * 10
     assert (np.asarray(clusters.block_of_sample) == np.arange(80)[:, None]).all()

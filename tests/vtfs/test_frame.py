@@ -83,7 +83,7 @@ def test_a_program_with_too_little_room_says_so(technique):
         (Sizes(sizes.cells, 2, sizes.pairs), True),
         (sizes, False),
     ):
-        program = frame.frame_program(technique, frame.planned(config, wrong))
+        program = frame.frame_program(technique, frame.planned(config, wrong), False)
         assert bool(program(inputs.environment(config))[1]) == overflows
 
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from tests import oracles
-from tests.strategies import SMALL, WIDE, a_camera, random_samples
+from tests.strategies import SMALL, WIDE, a_camera, gbuffer_of, positions_of, random_samples
 from vtfs.camera import Viewport
-from vtfs.gbuffer import from_runs, gbuffer_on_device, positions_on_device, to_runs
+from vtfs.gbuffer import from_runs, to_runs
 
 VIEWPORTS = [SMALL, WIDE, Viewport(1, 1), Viewport(8, 4), Viewport(9, 5)]
 
@@ -25,14 +25,14 @@ def test_each_pixel_is_in_its_run_and_comes_back(viewport):
 
 def test_padding_is_invalid():
     samples = random_samples(a_camera(), 0, valid_share=1.0)
-    assert int(positions_on_device(samples).valid.sum()) == SMALL.width_px * SMALL.height_px
+    assert int(positions_of(samples).valid.sum()) == SMALL.width_px * SMALL.height_px
 
 
 @pytest.mark.parametrize("precision", ["float32", "float16", "bfloat16"])
 def test_channels_have_their_precision_and_positions_keep_float32(precision):
     samples = random_samples(a_camera(), 0)
     samples.shininess[0, 0], samples.emissive[0, 0, 0] = 1e6, 3e38
-    gbuffer = gbuffer_on_device(samples, positions_on_device(samples), precision)
+    gbuffer = gbuffer_of(samples, precision)
     dtype = jnp.dtype(precision)
     for values, image in (
         (gbuffer.shininess, samples.shininess),

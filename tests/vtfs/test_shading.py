@@ -8,11 +8,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests import oracles
-from tests.strategies import SMALL, a_camera, nearby_lights, seeds, surface_samples
+from tests.strategies import SMALL, a_camera, gbuffer_of, nearby_lights, seeds, surface_samples
 from vtfs.bounds import Aabb
 from vtfs.camera import Viewport
 from vtfs.clusters import Clusters, everything
-from vtfs.gbuffer import gbuffer_on_device, positions_on_device
 from vtfs.light_lists import LightLists, view_lights
 from vtfs.reference import largest_relative_difference
 from vtfs.shading import chunk_blocks, chunk_work, longest_first, shade
@@ -28,7 +27,7 @@ def on_host(image, viewport):
 def a_frame(viewport, n_lights, seed, spots=False):
     samples = surface_samples(a_camera(viewport), seed)
     lights = nearby_lights(samples, n_lights, seed, spots)
-    return samples, lights, gbuffer_on_device(samples, positions_on_device(samples), "float32")
+    return samples, lights, gbuffer_of(samples, "float32")
 
 
 @pytest.mark.parametrize("batch", [0, 96, 2**24])
@@ -51,6 +50,7 @@ def test_each_cluster_is_lit_by_its_own_list_only(batch, seed):
     offset = np.concatenate([np.cumsum(counts) - counts, np.zeros(9)]).astype(np.int32)
     clusters = Clusters(
         clusters.key, clusters.box, jnp.int32(n_runs), jnp.asarray(run), jnp.arange(capacity), jnp.int32(n_runs),
+            jnp.int32(n_runs),
         jnp.asarray(of_sample.astype(np.int32)), jnp.bool_(False),
     )  # fmt: skip
     device = LightLists(
@@ -100,7 +100,7 @@ def test_blocks_are_ordered_by_length_and_those_not_used_come_last(capacity):
     rng = np.random.default_rng(capacity)
     counts = rng.integers(0, [3, 100, 20_000][capacity % 3], capacity).astype(np.int32)
     n_blocks = max(1, capacity // 2)
-    order = np.asarray(jax.jit(longest_first)(jnp.asarray(counts), jnp.int32(n_blocks)))
+    order = np.asarray(jax.jit(longest_first)(jnp.asarray(counts), jnp.int32(0), jnp.int32(n_blocks)))
     assert sorted(order) == list(range(capacity))
     assert set(order[:n_blocks]) == set(range(n_blocks))
     assert (np.diff(counts[order[:n_blocks]]) <= 0).all()

@@ -31,16 +31,20 @@ def render(
     json_file: JsonOption = None,
     verbose: VerboseOption = False,
 ) -> None:
-    """Image and heat map of lighting computations as PNG."""
+    """Image, heat map of lighting computations, and the technique's cells as PNG.
+
+    Of techniques with cells also: clusters in random colours, depth slices, and lights listed in vain.
+    """
     set_log_level(verbose)
     config = parsed_configuration(technique, settings)
     check_folder(out, resume=True)
     setup = scene.set_up()
+    from vtfs.cell_maps import cell_maps
     from vtfs.device import keep_compiled_programs
     from vtfs.frame import FrameInputs
     from vtfs.frame import count as count_frame
     from vtfs.frame import render as render_frame
-    from vtfs.image import exposure, heat_map, tone_map, write_png
+    from vtfs.image import exposure, heat_map, random_colours, tone_map, write_png
 
     keep_compiled_programs()
     written: list[dict[str, Any]] = []
@@ -50,17 +54,36 @@ def render(
             inputs = FrameInputs(setup.samples(number), setup.lights)
             image = render_frame(config, inputs)
             _, lengths = count_frame(config, inputs)
-        valid = inputs.seen()
+            maps = cell_maps(config, inputs)
+        seen, solid = inputs.seen(), inputs.samples.valid
         largest = int(lengths.of_sample.max(initial=0))
-        paths = [out / f"{kind}_{technique}_{number:04d}.png" for kind in ("image", "heat")]
-        write_png(paths[0], tone_map(image, exposure(image, valid)))
-        write_png(paths[1], heat_map(lengths.of_sample, largest, valid))
-        mean = float(lengths.of_sample[valid].mean()) if valid.any() else 0.0
-        written.append(
-            {"frame": number, "image": str(paths[0]), "heat_map": str(paths[1]), "largest": largest, "mean": mean}
-        )
-        if json_file != "-":
-            print(
-                f"{paths[0]}\n{paths[1]}  (lighting computations per pixel: {mean:.1f} in the mean, at most {largest})"
-            )
+        mean = float(lengths.of_sample[seen].mean()) if seen.any() else 0.0
+        pictures = {
+            "image": (tone_map(image, exposure(image, seen)), ""),
+            "heat_map": (
+                heat_map(lengths.of_sample, largest, seen),
+                f"lighting computations per pixel: {mean:.1f} in the mean, at most {largest}",
+            ),
+        }
+        if maps is not None:
+            in_vain, deepest = int(maps.false_positives.max(initial=0)), int(maps.depth_slice.max(initial=0))
+            pictures |= {
+                "clusters": (random_colours(maps.cell, solid), "clusters in random colours"),
+                "slices": (heat_map(maps.depth_slice, deepest, solid), f"depth slices, 0 to {deepest}"),
+                "false_positives": (
+                    heat_map(maps.false_positives, in_vain, solid),
+                    f"lights listed in vain: at most {in_vain}; "
+                    f"{maps.listed_per_reaching:.2f} listed for one that reaches",
+                ),
+            }
+        paths = {kind: out / f"{_FILE_NAMES.get(kind, kind)}_{technique}_{number:04d}.png" for kind in pictures}
+        for kind, (pixels, caption) in pictures.items():
+            write_png(paths[kind], pixels)
+            if json_file != "-":
+                print(f"{paths[kind]}{caption and f'  ({caption})'}")
+        files = {kind: str(path) for kind, path in paths.items()}
+        written.append({"frame": number, **files, "largest": largest, "mean": mean})
     write_json(json_file, {"technique": config.technique, "params": config.params, "pictures": written})
+
+
+_FILE_NAMES = {"heat_map": "heat"}

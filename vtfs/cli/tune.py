@@ -13,7 +13,7 @@ from vtfs.cli.options import JsonOption, VerboseOption, check_folder, set_log_le
 from vtfs.cli.scene_arguments import SceneArguments, with_scene
 from vtfs.cli.status import Status
 from vtfs.input_error import InputError
-from vtfs.parameters import PARAMETERS, TECHNIQUES, configuration
+from vtfs.parameters import PARAMETERS, TECHNIQUES, TUNED_TECHNIQUES, configuration
 
 
 @with_scene
@@ -21,7 +21,11 @@ def tune(
     scene: SceneArguments,
     techniques: Annotated[
         str | None,
-        typer.Option(help="Comma-separated; default: all that counting finds worth measuring.", metavar="A,B"),
+        typer.Option(
+            help="Comma-separated, or `all`; those that counting finds hopeless are not measured.",
+            metavar="A,B",
+            show_default=", ".join(TUNED_TECHNIQUES),
+        ),
     ] = None,
     space: Annotated[Path | None, typer.Option(help="Search space as TOML.", metavar="FILE")] = None,
     budget: Annotated[
@@ -67,7 +71,7 @@ def tune(
     options = TuneOptions(
         out,
         names,
-        names if techniques else (),
+        names if techniques and techniques.strip() != "all" else (),
         own_space,
         budget_parsed or DEFAULT_BUDGET,
         objective,
@@ -87,6 +91,8 @@ def tune(
 
 def _technique_names(given: str | None) -> tuple[str, ...]:
     if given is None:
+        return TUNED_TECHNIQUES
+    if given.strip() == "all":
         return tuple(TECHNIQUES)
     names = tuple(dict.fromkeys(name.strip() for name in given.split(",") if name.strip()))
     for name in names or ("",):
