@@ -144,8 +144,8 @@ def _extent(
     low = jnp.min(jnp.where(in_block, value, jnp.inf), axis=1)
     high = jnp.max(jnp.where(in_block, value, -jnp.inf), axis=1)
     return (
-        jnp.full(cluster.shape, jnp.inf).at[cluster].min(low, mode="drop"),
-        jnp.full(cluster.shape, -jnp.inf).at[cluster].max(high, mode="drop"),
+        jnp.full(cluster.shape, jnp.inf, jnp.float32).at[cluster].min(low, mode="drop"),
+        jnp.full(cluster.shape, -jnp.inf, jnp.float32).at[cluster].max(high, mode="drop"),
     )
 
 

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 
 from tuning.space import LARGEST_SPACE, Space, accuracy_values, default_space, load_space
 from vtfs.input_error import InputError
-from vtfs.parameters import TECHNIQUES, configuration
+from vtfs.parameters import TUNED_TECHNIQUES, configuration
 
-ALL = tuple(TECHNIQUES)
+ALL = TUNED_TECHNIQUES
 
 
 @pytest.fixture
@@ -173,7 +173,7 @@ def test_a_space_too_large_to_count_is_refused_before_it_is_made(space_file):
 
 
 def test_a_parameter_that_no_chosen_technique_has_is_refused(space_file):
-    with pytest.raises(InputError, match="forward does not have it; choose from batch, gbuffer, light_cutoff"):
+    with pytest.raises(InputError, match="forward does not have it; choose from prepass, batch, gbuffer, light_cutoff"):
         load_space(space_file("[parameters]\ntile_px = [16]\n"), ["forward"])
 
 

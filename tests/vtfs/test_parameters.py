@@ -64,7 +64,7 @@ def test_defaults_are_those_of_the_design():
     defaults = {name: parameter.default for name, parameter in PARAMETERS.items()}
     assert defaults == {
         "tile_px": 32, "depth_slices": 0, "branching": 32, "batch": 0, "bounds": "implicit", "gbuffer": "float32",
-        "light_cutoff": 0.0,
+        "light_cutoff": 0.0, "prepass": "on",
     }  # fmt: skip
 
 
@@ -76,7 +76,7 @@ def test_configurations_that_do_the_same_are_equal():
 
 
 def test_an_unknown_technique_is_refused_with_those_there_are():
-    with pytest.raises(InputError, match=r"technique `magic`: unknown; choose from forward, tiled_deferred"):
+    with pytest.raises(InputError, match=r"technique `magic`: unknown; choose from forward, .*volume_tiled_bvh"):
         configuration("magic")
 
 

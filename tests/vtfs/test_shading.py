@@ -77,7 +77,8 @@ def test_very_long_lists_lose_no_light(batch):
     two = zeros.at[:2].set(jnp.arange(2, dtype=jnp.int32))
     clusters = Clusters(
         zeros, Aabb(*(jnp.zeros(1),) * 6), jnp.int32(2), two, two,
-        jnp.int32(2), jnp.broadcast_to(jnp.arange(2, dtype=jnp.int32)[:, None], (2, 32)), jnp.bool_(False),
+        jnp.int32(2), jnp.int32(2), jnp.broadcast_to(jnp.arange(2, dtype=jnp.int32)[:, None], (2, 32)),
+        jnp.bool_(False),
     )  # fmt: skip
     # All but the last entry of each list name a black light.
     index = np.zeros(lengths.sum(), np.int32)
