@@ -49,14 +49,17 @@ def main() -> None:
             config = configuration(technique, {"batch": batch})
             counts, _ = count(config, inputs)
             env, sizes = run_stages(config, inputs, counts.sizes)
-            program, arguments = frame_program(technique, planned(config, sizes)), inputs.environment(config)
+            program, arguments = (
+                frame_program(technique, planned(config, sizes), inputs.has_transparent),
+                inputs.environment(config),
+            )
             frame_ms = median_ms(lambda program=program, arguments=arguments: program(arguments))
             worst = largest_relative_difference(
                 image_on_host(env["shade_opaque"], inputs), reference, inputs.samples.valid
             )
             at = counts.at_batch(batch)
             stages = {}
-            for stage in REGISTRY[technique].stages:
+            for stage in REGISTRY[technique].stages_of(inputs.has_transparent):
                 own = stage_program(stage, narrowed(stage, planned(config, sizes)))
                 stages[stage.name] = median_ms(
                     lambda own=own, stage=stage, env=env: own(*(env[n] for n in stage.needs))

@@ -79,6 +79,16 @@ class SceneSetup:
         return self._source.samples(self.cameras, frame)
 
     @property
+    def scene(self) -> Scene | None:
+        """The geometry; None where the samples are the user's own."""
+        return self._source.scene if isinstance(self._source, _TracedScene) else None
+
+    @property
+    def bounds_m(self) -> tuple[np.ndarray, np.ndarray]:
+        """Low and high corner of the scene, or of its visible samples."""
+        return self._source.bounds_m(self.cameras)
+
+    @property
     def counted_frames(self) -> tuple[int, ...]:
         """At most 12 evenly spaced frames of the path."""
         n = min(self.n_frames, MAX_COUNTED_FRAMES)
@@ -93,9 +103,8 @@ class SceneSetup:
 
         def scatter() -> dict[str, np.ndarray]:
             visible = [self._some_positions(frame) for frame in self.counted_frames]
-            bounds_m = self._source.bounds_m(self.cameras)
             scattered = scatter_lights(
-                bounds_m, n_lights, self.seed, np.concatenate(visible), options.lights_per_sample, options.density
+                self.bounds_m, n_lights, self.seed, np.concatenate(visible), options.lights_per_sample, options.density
             )
             return {field.name: getattr(scattered, field.name) for field in fields(scattered)}
 
@@ -117,17 +126,17 @@ class _TracedScene:
     """View samples by primary rays."""
 
     def __init__(self, scene: Scene):
-        self._scene = scene
+        self.scene = scene
         self._tracer: Tracer | None = None
         self.key = scene.key
 
     def samples(self, cameras: CameraPath, frame: int) -> ViewSamples:
         if self._tracer is None:
-            self._tracer = Tracer(self._scene)
-        return trace_view_samples(self._scene, cameras.camera(frame), self._tracer)
+            self._tracer = Tracer(self.scene)
+        return trace_view_samples(self.scene, cameras.camera(frame), self._tracer)
 
     def bounds_m(self, cameras: CameraPath) -> tuple[np.ndarray, np.ndarray]:
-        return self._scene.bounds_m
+        return self.scene.bounds_m
 
 
 class _OwnSamples:
