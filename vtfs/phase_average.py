@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from vtfs.cluster_grid import _BOX_SLACK, _PIXEL_SLACK_PX
 
 NEWTON_STEPS = 4
-"""Two leave 1e-4 of the count, three 1e-5."""
+"""Enough to find the faces that a root lies outside of; its place is then computed exactly."""
 
 _SMALLEST = 1e-9
 _FLATTEST = 1e-6
@@ -105,24 +105,40 @@ def _first_met(box: Box, centre: Point, radius: Pairs, growth: Float[Array, ""],
     """The factor nearest to 1, on the upper (1) or lower (-1) side of it, at which a sphere meets so many times the box;
     at least by a factor of `growth` away where it meets none."""
 
-    def step(f: Pairs, box: Box, centre: Point, radius: Pairs) -> Pairs:
-        squares, rise = jnp.zeros_like(f), jnp.zeros_like(f)
-        for c, span in zip(centre, box, strict=True):
-            below, above = span.low * f - c, c - span.high * f
-            outside = jnp.maximum(jnp.maximum(below, above), 0)
-            squares += outside * outside
-            rise += outside * jnp.where(below > above, span.low, -span.high)
-        distance = jnp.sqrt(jnp.maximum(squares, _SMALLEST**2))
-        # The distance rises by rise / distance. Where it does not fall to the side, the step leaves the range.
-        fall = jnp.maximum(-side * rise, _FLATTEST * distance) / distance
-        # At a root a step moves with the distance alone: the derivative of the slope does not matter there.
-        next_f = f + side * jnp.maximum(distance - radius, 0) / jax.lax.stop_gradient(fall)
-        return jnp.clip(next_f, 1 / growth, growth)
+    def parabola(f: Pairs, box: Box, centre: Point, radius: Pairs) -> tuple[Pairs, Pairs, Pairs]:
+        """a, b, c of `a s**2 + 2 b s + c`, the squared distance at `f + s` minus that of the radius, while the sphere's centre is
+        outside the same faces as at `f`."""
+        a, b, c = jnp.zeros_like(f), jnp.zeros_like(f), -(radius**2)
+        for at, span in zip(centre, box, strict=True):
+            below, above = span.low * f - at, at - span.high * f
+            is_outside = jnp.maximum(below, above) > 0
+            rise = jnp.where(is_outside, jnp.where(below > above, span.low, -span.high), 0.0)
+            outside = jnp.where(is_outside, jnp.maximum(below, above), 0.0)
+            a, b, c = a + rise * rise, b + outside * rise, c + outside * outside
+        return a, b, c
 
     # Only the last step is differentiated: through all of them, XLA computes each one again for each use of it.
     fixed = jax.lax.stop_gradient((box, centre, radius))
-    f = jax.lax.fori_loop(0, NEWTON_STEPS - 1, lambda _, f: step(f, *fixed), jnp.ones_like(fixed[2]))
-    return step(jax.lax.stop_gradient(f), box, centre, radius)
+    limits = jax.lax.stop_gradient((1 / growth, growth))
+    one = jnp.ones_like(fixed[2])
+
+    def newton(_, f: Pairs) -> Pairs:
+        _, b, c = parabola(f, *fixed)
+        distance = jnp.sqrt(jnp.maximum(c + fixed[2] ** 2, _SMALLEST**2))
+        # The distance rises by b / distance. Where it does not fall to the side, the step leaves the range.
+        fall = jnp.maximum(-side * b, _FLATTEST * distance) / distance
+        return jnp.clip(f + side * jnp.maximum(distance - fixed[2], 0) / fall, *limits)
+
+    near_root = jax.lax.stop_gradient(jax.lax.fori_loop(0, NEWTON_STEPS, newton, one))
+    # The root of the parabola, which does not depend on where it was taken. It is exact too where the sphere is
+    # hardly met, and Newton's method comes to the double root by halves.
+    a, b, c = parabola(near_root, box, centre, radius)
+    discriminant = b * b - a * c
+    falls = -side * b + jnp.sqrt(jnp.where(discriminant > 0, discriminant, 1.0))
+    has_root = (discriminant > 0) & (falls > _SMALLEST)
+    root = near_root + side * c / jnp.where(has_root, falls, 1.0)
+    root = jnp.where(has_root, jnp.clip(root, 1 / growth, growth), limits[0] if side < 0 else limits[1])
+    return jnp.where(parabola(one, *fixed)[2] <= 0, 1.0, root)
 
 
 def tile_share(
