@@ -1,9 +1,10 @@
 """One light and one sample: at what share of the phases of the grid the light is in the list of the sample's cell.
 
 Bounds are implicit: a cell is its tile's rays cut by two depths, and a light is listed where its sphere meets the box
-of the cell. The phases `u`, `v`, `w` of a sample are uniform in [0, 1] and independent: its tile spans pixels `X - u t_x` to
-`X + (1 - u) t_x` (cut off at the image's sides, as the last tiles of a grid are) and `Y - v t_y` to `Y + (1 - v) t_y`; its
-slice spans depths `F / g` to `F` with `F = d g**(1 - w)`, where `d` is its depth and `g` the growth from slice to slice.
+of the cell. The phases `u`, `v`, `w` of a sample are uniform in [0, 1] and independent: its tile spans
+pixels `X - u t_x` to `X + (1 - u) t_x` (cut off at the image's sides, as the last tiles of a grid are), `Y` likewise
+with `v`; its slice spans depths `F / g` to `F` with `F = d g**(1 - w)`, where `d` is its depth and `g` the growth from
+slice to slice.
 
 An average of the indicator over sampled phases would have no derivative. Instead one phase is integrated
 in closed form, on an interval whose ends move smoothly with all variables, for a hard edge of the light as well.
@@ -31,8 +32,8 @@ Pairs = Float[Array, "*pairs"]
 class Span(eqx.Module):
     """Where a box is on one axis."""
 
-    low: Pairs
-    high: Pairs
+    low: Pairs | float
+    high: Pairs | float
 
     def distance(self, c: Pairs) -> Pairs:
         return jnp.maximum(jnp.maximum(self.low - c, c - self.high), 0)
@@ -86,10 +87,11 @@ def cell_box(rays: tuple[Span, Span], near: Pairs, far: Pairs) -> Box:
 def depth_share(rays: tuple[Span, Span], centre: Point, radius: Pairs, log_growth: Float[Array, ""]) -> Pairs:
     """Share of the depth phases at which a sphere meets the box of the sample's cell; lengths in units of its depth.
 
-    Given `u` and `v`, the box of the cell is `F B`, where `B` is that for `F = 1`: it grows from the eye. The distance from the
-    light's centre to `F B` is a norm of terms `max(0, low F - c, c - high F)`, so convex in `F`: the light is met on one interval
-    `[F_a, F_b]` of `[1, g]`. As `log F` is uniform, the share is `log(F_b / F_a) / log g`. The ends are roots of the distance minus
-    the radius; Newton's method comes to a root of a convex function from one side and never passes it.
+    Given `u` and `v`, the box of the cell is `F B`, where `B` is that for `F = 1`: it grows from the eye. The
+    distance from the light's centre to `F B` is a norm of terms `max(0, low F - c, c - high F)`, so convex in `F`:
+    the light is met on one interval `[F_a, F_b]` of `[1, g]`. As `log F` is uniform, the share is `log(F_b / F_a) /
+    log g`. The ends are roots of the distance minus the radius; Newton's method comes to a root of a convex
+    function from one side and never passes it.
 
     The share is continuous in `u`, `v` and everything else, which the indicator is not: a mean over points of `u`
     and `v` has the derivative of the expectation as its expected derivative.
@@ -102,12 +104,12 @@ def depth_share(rays: tuple[Span, Span], centre: Point, radius: Pairs, log_growt
 
 
 def _first_met(box: Box, centre: Point, radius: Pairs, growth: Float[Array, ""], side: float) -> Pairs:
-    """The factor nearest to 1, on the upper (1) or lower (-1) side of it, at which a sphere meets so many times the box;
-    at least by a factor of `growth` away where it meets none."""
+    """The factor nearest to 1, on the upper (1) or lower (-1) side of it, at which a sphere meets so many times the
+    box; at least by a factor of `growth` away where it meets none."""
 
     def parabola(f: Pairs, box: Box, centre: Point, radius: Pairs) -> tuple[Pairs, Pairs, Pairs]:
-        """a, b, c of `a s**2 + 2 b s + c`, the squared distance at `f + s` minus that of the radius, while the sphere's centre is
-        outside the same faces as at `f`."""
+        """a, b, c of `a s**2 + 2 b s + c`, the squared distance at `f + s` minus that of the radius, while the
+        sphere's centre is outside the same faces as at `f`."""
         a, b, c = jnp.zeros_like(f), jnp.zeros_like(f), -(radius**2)
         for at, span in zip(centre, box, strict=True):
             below, above = span.low * f - at, at - span.high * f
@@ -152,10 +154,11 @@ def tile_share(
 ) -> Pairs:
     """Share of the tile phases at which a sphere meets the box of the sample's tile, which has no depth phase.
 
-    Without it the depth of the light is outside the tile by a fixed `d_z`, and `d_x(u)**2 + d_y(v)**2 + d_z**2 <= r**2` has to hold. Each
-    `d` falls and rises again with its phase, so it is below a bound on one interval, in closed form. The interval of `u`
-    leaves out what no `v` makes good: there the length of the interval of `v`, which is exact, is continuous. One point
-    within the interval of `u`, times the lengths of both, has the share as its expectation.
+    Without it the depth of the light is outside the tile by a fixed `d_z`, and `d_x(u)**2 + d_y(v)**2 + d_z**2 <=
+    r**2` has to hold. Each `d` falls and rises again with its phase, so it is below a bound on one interval, in
+    closed form. The interval of `u` leaves out what no `v` makes good: there the length of the interval of `v`,
+    which is exact, is continuous. One point within the interval of `u`, times the lengths of both, has the share as
+    its expectation.
 
     A light that no tile of the image holds in x, y or depth is met by all tiles along that side at once as its
     radius grows. That is a step of the count itself, unless the edge is soft: radii are then a third interval.
@@ -167,9 +170,8 @@ def tile_share(
     - `points`: places within the intervals of the radius and of `u`, in (0, 1).
     """
     near_m, far_m = depth_range_m
-    whole = tile_rays(screen, Span(0.0, screen.width_px), Span(0.0, screen.height_px))  # type: ignore[arg-type]
-    _, least_y, least_z = (span.distance(c) for span, c in zip(cell_box(whole, near_m, far_m), centre_m, strict=True))
-    least_x = cell_box(whole, near_m, far_m)[0].distance(centre_m[0])
+    whole = cell_box(tile_rays(screen, Span(0.0, screen.width_px), Span(0.0, screen.height_px)), near_m, far_m)
+    least_x, least_y, least_z = (span.distance(c) for span, c in zip(whole, centre_m, strict=True))
     least_m = _root(least_x**2 + least_y**2 + least_z**2)
 
     smallest_m, largest_m = radius_m
@@ -188,7 +190,7 @@ def tile_share(
 
     first_u, last_u = interval(0, screen.width_px, _root(reach2 - least_y**2))
     u = first_u + (last_u - first_u) * points[1]
-    rays = tile_rays(screen, tile_at(position_px[0], tile_px[0], u), Span(0.0, screen.height_px))  # type: ignore[arg-type]
+    rays = tile_rays(screen, tile_at(position_px[0], tile_px[0], u), Span(0.0, screen.height_px))
     outside_x = cell_box(rays, near_m, far_m)[0].distance(centre_m[0])
     first_v, last_v = interval(1, screen.height_px, _root(reach2 - outside_x**2))
     return edge_share * (last_u - first_u) * (last_v - first_v)

@@ -1,8 +1,8 @@
 """Expected lighting computations: a smooth function of the grid, the lights and the camera.
 
-The exact count of a frame is a step function of the tile size, of the slices and of every light. Averaged over the phase
-of the grid (its tiles and slices shifted by a random part of a cell, so that a sample lies uniformly within its cell)
-it is continuous, and its gradient says which way to move:
+The exact count of a frame is a step function of the tile size, of the slices and of every light. Averaged over the
+phase of the grid (its tiles and slices shifted by a random part of a cell, so that a sample lies uniformly within
+its cell) it is continuous, and its gradient says which way to move:
 
 ```python
 frame = relaxed_frame(samples, n_samples=2048)
@@ -23,13 +23,15 @@ the lights: the phases `u` and `v` take the points of a low-discrepancy sequence
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vtfs.camera import Viewport
-from vtfs.phase_average import Point, Screen, Span, cell_box, depth_share, tile_at, tile_rays, tile_share
+from vtfs.phase_average import Point, Screen, cell_box, depth_share, tile_at, tile_rays, tile_share
 
 CHUNK = 2**13
 """Pairs evaluated at once: their temporaries stay in the cache of a CPU."""
@@ -37,6 +39,7 @@ CHUNK = 2**13
 _SHALLOWEST_M = 1e-6
 
 Scalar = Float[Array, ""]
+Columns = tuple[Float[Array, "pairs 1"], ...]
 
 
 class CountVariables(eqx.Module):
@@ -59,8 +62,8 @@ class CountVariables(eqx.Module):
     light_y_m: Float[Array, " lights"]
     light_z_m: Float[Array, " lights"]
     light_range_m: Float[Array, " lights"]
-    eye_m: Float[Array, "3"]
-    turn_rad: Float[Array, "3"]
+    eye_m: Float[Array, 3]
+    turn_rad: Float[Array, 3]
     tan_half_y: Scalar
 
 
@@ -90,7 +93,7 @@ class RelaxedFrame(eqx.Module):
 class CandidatePairs(eqx.Module):
     """All pairs of a sample and a light that count at some phase, by sample; made by `candidate_pairs`.
 
-    - `in_use`: false for padding, which pairs the first sample with the first light.
+    - `in_use`: false for padding, which comes last.
     """
 
     sample: Int[Array, " capacity"]
@@ -103,9 +106,9 @@ def expected_lighting_computations(
 ) -> Scalar:
     """Lighting computations of the whole frame with implicit bounds, averaged over the phase of the grid.
 
-    Differentiable in `variables`, with hard and with soft edges. One exception: in tiled shading (`depth_slices` None) with
-    hard edges, a light that begins to reach into the view from outside is counted at once by all tiles along that
-    side, a step of the count itself; a temperature above 0 makes it smooth.
+    Differentiable in `variables`, with hard and with soft edges. One exception: in tiled shading (`depth_slices`
+    None) with hard edges, a light that begins to reach into the view from outside is counted at once by all tiles
+    along that side, a step of the count itself; a temperature above 0 makes it smooth.
 
     **Arguments:**
 
@@ -114,12 +117,13 @@ def expected_lighting_computations(
       range: what a cell does at the light's edge falls linearly from counted to not. In [0, 1); 0 is a hard edge.
     """
 
-    def add_chunk(total, rows):
-        return total + jnp.sum(_expected(variables, frame, temperature, rows)), None
+    shares = _shares(variables, frame, temperature)
+
+    def add_chunk(total, chunk):
+        return total + jnp.sum(shares(chunk)), None
 
     # What a chunk leaves behind is made again on the way back: keeping it costs more than the arithmetic.
-    zero = jnp.zeros((), frame.x_m.dtype)
-    total, _ = jax.lax.scan(jax.checkpoint(add_chunk), zero, _chunks(variables, frame, pairs))
+    total, _ = jax.lax.scan(jax.checkpoint(add_chunk), jnp.zeros((), frame.x_m.dtype), _chunks(pairs))
     return total * frame.weight
 
 
@@ -131,13 +135,12 @@ def expected_list_lengths(
     Their standard deviation over the root of their number bounds the standard error of subsampling: the samples
     are spread evenly over the image, which leaves less.
     """
-    shares = jax.lax.map(lambda rows: _expected(variables, frame, temperature, rows), _chunks(variables, frame, pairs))
-    shares = shares.ravel()[: pairs.sample.shape[0]]
+    shares = jax.lax.map(_shares(variables, frame, temperature), _chunks(pairs)).ravel()[: pairs.sample.shape[0]]
     return jax.ops.segment_sum(shares, pairs.sample, num_segments=frame.n_samples)
 
 
 def lighting_computations_at_phase(
-    variables: CountVariables, frame: RelaxedFrame, pairs: CandidatePairs, phase: Float[Array, "3"]
+    variables: CountVariables, frame: RelaxedFrame, pairs: CandidatePairs, phase: Float[Array, 3]
 ) -> Int[Array, ""]:
     """What the frame's own samples cost on one grid, exactly: what `expected_lighting_computations` is the mean of.
 
@@ -149,14 +152,14 @@ def lighting_computations_at_phase(
     **Returns:** a count of the frame's samples; times `frame.weight`, of the whole image.
     """
 
-    def add_chunk(total, rows):
-        screen, (x_px, y_px), depth_m, centre_m, range_m, _ = _pair(variables, frame, rows)
-        height_px = frame.viewport.height_px
+    screen, rows_of = _screen(variables, frame), _rows(variables, frame)
+    height_px = frame.viewport.height_px
+
+    def n_listed(chunk: CandidatePairs) -> Int[Array, ""]:
+        (x_px, y_px, depth_m), (*centre_m, range_m), _ = rows_of(chunk)
         u = (x_px / variables.tile_px_x + phase[0]) % 1
         from_bottom = 1 - ((height_px - y_px) / variables.tile_px_y + phase[1]) % 1
-        rays = tile_rays(
-            screen, tile_at(x_px, variables.tile_px_x, u), tile_at(y_px, variables.tile_px_y, from_bottom)
-        )
+        rays = tile_rays(screen, tile_at(x_px, variables.tile_px_x, u), tile_at(y_px, variables.tile_px_y, from_bottom))
         if variables.depth_slices is None:
             box = cell_box(rays, variables.near_m, frame.far_m)
         else:
@@ -164,12 +167,12 @@ def lighting_computations_at_phase(
             w = (jnp.log(depth_m / variables.near_m) / growth + phase[2]) % 1
             box = cell_box(rays, depth_m * jnp.exp(-w * growth), depth_m * jnp.exp((1 - w) * growth))
         squares = sum(span.distance(c) ** 2 for span, c in zip(box, centre_m, strict=True))
-        is_listed = (squares <= range_m**2) & rows[3][:, None]
-        return total + jnp.sum(is_listed, dtype=jnp.int32), None
+        return jnp.sum((squares <= range_m**2) & chunk.in_use[:, None], dtype=jnp.int32)
 
-    # Every phase point of a sample would count the same: one is enough.
-    alone = eqx.tree_at(lambda f: f.phase, frame, frame.phase[:, :1])
-    return jax.lax.scan(add_chunk, jnp.int32(0), _chunks(variables, alone, pairs))[0]
+    def add_chunk(total, chunk: CandidatePairs):
+        return total + jax.lax.cond(chunk.in_use[0], n_listed, lambda _: jnp.int32(0), chunk), None
+
+    return jax.lax.scan(add_chunk, jnp.int32(0), _chunks(pairs))[0]
 
 
 def log_growth(variables: CountVariables, far_m: Scalar) -> Scalar:
@@ -178,10 +181,11 @@ def log_growth(variables: CountVariables, far_m: Scalar) -> Scalar:
 
 
 def cubic_depth_slices(tile_px_y: Scalar, near_m: Scalar, tan_half_y: Scalar, frame: RelaxedFrame) -> Scalar:
-    """Slices that make cells as deep as they are high: `log(far / near) / log g`, `g = 1 + 2 tan(theta) / S_y`, `S_y = h / t_y`.
+    """Slices that make cells as deep as they are high: `log(far / near) / log g`, `g = 1 + 2 tan(theta) / S_y`,
+    `S_y = h / t_y`.
 
-    Olsson et al. 2012, Eq. 1; van Oosten 2017, Eq. 8.2, both without rounding, so that in a function that is differentiated
-    `depth_slices` may follow `tile_px_y`.
+    Olsson et al. 2012, Eq. 1; van Oosten 2017, Eq. 8.2, both without rounding, so that in a function that is
+    differentiated `depth_slices` may follow `tile_px_y`.
     """
     return jnp.log(frame.far_m / near_m) / jnp.log1p(2 * tan_half_y * tile_px_y / frame.viewport.height_px)
 
@@ -222,43 +226,57 @@ def _product(a: Array, b: Array) -> Array:
     return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)
 
 
-def _chunks(variables: CountVariables, frame: RelaxedFrame, pairs: CandidatePairs) -> tuple[Array, Array, Array, Array]:
-    """Sample, light, phases and use of all pairs in chunks, gathered once, a row a pair."""
-    lights = in_view(variables, frame, variables.light_x_m, variables.light_y_m, variables.light_z_m)
-    light_row = jnp.stack([*lights, variables.light_range_m], axis=1)
-    sample_row = jnp.stack(on_screen(variables, frame), axis=1)
+def _chunks(pairs: CandidatePairs) -> CandidatePairs:
+    """`[chunks, CHUNK]`, or one chunk of fewer."""
     n_pairs = pairs.sample.shape[0]
     size = max(1, min(CHUNK, n_pairs))
-
-    def chunked(rows: Array) -> Array:
-        padded = jnp.pad(rows, ((0, -n_pairs % size), *((0, 0),) * (rows.ndim - 1)))
-        return padded.reshape(-1, size, *rows.shape[1:])
-
-    in_use = chunked(pairs.in_use)
-    return chunked(sample_row[pairs.sample]), chunked(light_row[pairs.light]), chunked(frame.phase[pairs.sample]), in_use
+    return jax.tree.map(lambda column: jnp.pad(column, (0, -n_pairs % size)).reshape(-1, size), pairs)
 
 
-def _pair(variables: CountVariables, frame: RelaxedFrame, rows):
-    """Screen, pixel, depth, light and phases of the pairs of a chunk, as columns to broadcast against phases."""
-    sample, light, phase, in_use = rows
-    # Padding may have depth 0, where derivatives are not finite.
-    x_px, y_px, depth_m = (jnp.where(in_use, sample[:, c], 1.0)[:, None] for c in range(3))
-    x_m, y_m, z_m, range_m = (light[:, c][:, None] for c in range(4))
-    return _screen(variables, frame), (x_px, y_px), depth_m, (x_m, y_m, z_m), range_m, jnp.moveaxis(phase, -1, 0)
+def _rows(variables: CountVariables, frame: RelaxedFrame) -> Callable[[CandidatePairs], tuple[Columns, Columns, Array]]:
+    """What gathers, for a chunk of pairs, its samples (pixel from the left and the bottom, depth), its lights (x,
+    y, depth, range) and its phases; columns, to broadcast against phases."""
+    lights = in_view(variables, frame, variables.light_x_m, variables.light_y_m, variables.light_z_m)
+    # Whole rows: one gather, and on the way back one scatter.
+    light_row = jnp.stack([*lights, variables.light_range_m], axis=1)
+    sample_row = jnp.stack(on_screen(variables, frame), axis=1)
+    if not light_row.shape[0]:
+        light_row = jnp.zeros((1, 4), light_row.dtype)  # what padding reads where there are no lights
+
+    def gather(chunk: CandidatePairs) -> tuple[Columns, Columns, Array]:
+        sample, light = sample_row[chunk.sample], light_row[chunk.light]
+        return _columns(sample), _columns(light), frame.phase[chunk.sample]
+
+    return gather
 
 
-def _expected(variables: CountVariables, frame: RelaxedFrame, temperature: Scalar | float, rows) -> Array:
-    """Share of the phases at which each pair of a chunk counts."""
-    screen, position_px, depth_m, centre_m, range_m, (u, v, edge) = _pair(variables, frame, rows)
+def _columns(rows: Float[Array, "pairs columns"]) -> Columns:
+    return tuple(rows[:, c : c + 1] for c in range(rows.shape[1]))
+
+
+def _shares(
+    variables: CountVariables, frame: RelaxedFrame, temperature: Scalar | float
+) -> Callable[[CandidatePairs], Float[Array, " pairs"]]:
+    """What gives the share of the phases at which each pair of a chunk counts."""
+    screen, rows_of = _screen(variables, frame), _rows(variables, frame)
     tile_px = (variables.tile_px_x, variables.tile_px_y)
-    if variables.depth_slices is None:
-        depth_range_m = (variables.near_m, frame.far_m)
-        radius_m = (range_m * (1 - temperature), range_m * (1 + temperature))
-        share = tile_share(screen, position_px, tile_px, depth_range_m, centre_m, radius_m, (edge, u))
-    else:
-        tiles: list[Span] = [tile_at(p, t, phase) for p, t, phase in zip(position_px, tile_px, (u, v), strict=True)]
-        rays = tile_rays(screen, tiles[0], tiles[1])
-        radius = range_m * (1 + temperature * (2 * edge - 1)) / depth_m
-        x, y, z = (c / depth_m for c in centre_m)
-        share = depth_share(rays, (x, y, z), radius, log_growth(variables, frame.far_m))
-    return jnp.where(rows[3], jnp.mean(share, axis=1), 0.0)
+
+    def shares(chunk: CandidatePairs) -> Float[Array, " pairs"]:
+        (x_px, y_px, depth_m), (x_m, y_m, z_m, range_m), phase = rows_of(chunk)
+        u, v, edge = phase[..., 0], phase[..., 1], phase[..., 2]
+        if variables.depth_slices is None:
+            depth_range_m = (variables.near_m, frame.far_m)
+            radius_m = (range_m * (1 - temperature), range_m * (1 + temperature))
+            share = tile_share(screen, (x_px, y_px), tile_px, depth_range_m, (x_m, y_m, z_m), radius_m, (edge, u))
+        else:
+            rays = tile_rays(screen, tile_at(x_px, tile_px[0], u), tile_at(y_px, tile_px[1], v))
+            radius = range_m * (1 + temperature * (2 * edge - 1)) / depth_m
+            centre = (x_m / depth_m, y_m / depth_m, z_m / depth_m)
+            share = depth_share(rays, centre, radius, log_growth(variables, frame.far_m))
+        return jnp.where(chunk.in_use, jnp.mean(share, axis=1), 0.0)
+
+    def none(chunk: CandidatePairs) -> Float[Array, " pairs"]:
+        return jnp.zeros(chunk.sample.shape, frame.x_m.dtype)
+
+    # Pairs in use come first: chunks of padding cost nothing.
+    return lambda chunk: jax.lax.cond(chunk.in_use[0], shares, none, chunk)

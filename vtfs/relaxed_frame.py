@@ -27,8 +27,8 @@ _PLASTIC = 1.2207440846057596  # root of x**4 = x + 1: Roberts' sequence in thre
 def relaxed_frame(samples: ViewSamples, n_samples: int = 2048, n_phases: int = 1) -> RelaxedFrame:
     """Samples spread evenly over the image, each with its own points of a low-discrepancy sequence. Deterministic.
 
-    Along a Z-order curve over the valid pixels every so manieth one is taken. For the count of a whole frame more samples
-    are worth more than more phases of each: one is enough; several serve single samples.
+    Along a Z-order curve over the valid pixels every so manieth one is taken. For the count of a whole frame more
+    samples are worth more than more phases of each: one is enough; several serve single samples.
 
     **Arguments:**
 
@@ -155,9 +155,7 @@ def _reaches(variables: CountVariables, frame: RelaxedFrame, temperature, margin
     x, y, z = cell_box(tile_rays(_screen(variables, frame), *tiles), near_m, far_m)
     shape = depth_m.shape
     box = Aabb(*(jnp.broadcast_to(side, shape) for side in (x.low, y.low, -z.high, x.high, y.high, -z.low)))
-    light_x, light_y, light_z = in_view(
-        variables, frame, variables.light_x_m, variables.light_y_m, variables.light_z_m
-    )
+    light_x, light_y, light_z = in_view(variables, frame, variables.light_x_m, variables.light_y_m, variables.light_z_m)
     range_m = variables.light_range_m
     reach_m = range_m * (1 + temperature + 2 * margin)
     return box, Sphere(jnp.where(range_m > 0, light_x, jnp.inf), light_y, -light_z, reach_m)
@@ -173,9 +171,11 @@ def _assigned(boxes: Aabb, spheres: Sphere, capacity: int):
 
 
 def _rounded_up(n_pairs: int) -> int:
-    """One of eight sizes to a power of two, at least 1024: few programs, little padding."""
-    step = max(1024, 2 ** max(0, n_pairs.bit_length() - 4))
-    return max(step, -(-n_pairs // step) * step)
+    """One of few capacities, so that few programs are compiled; what is not in use costs no time."""
+    capacity = 2**14
+    while capacity < n_pairs:
+        capacity *= 4
+    return capacity
 
 
 def _spread_bits(value: np.ndarray) -> np.ndarray:

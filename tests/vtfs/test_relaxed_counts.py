@@ -64,7 +64,7 @@ def all_pairs(n_samples: int, n_lights: int) -> CandidatePairs:
     return CandidatePairs(jnp.asarray(sample), jnp.asarray(light), jnp.ones(len(sample), bool))
 
 
-def listed_by_oracle(variables, frame, phase, radius_scale=1.0) -> np.ndarray:
+def listed_by_oracle(variables, frame, phase, radius_scale: np.ndarray | float = 1.0) -> np.ndarray:
     """Brute force, bool `[samples, lights]`: the corners of each sample's cell, their box, and the sphere.
 
     `phase`: how much of its cell lies left of, above and nearer than each sample, `[3]` or `[3, samples, 1]`.
@@ -128,8 +128,8 @@ def test_it_is_the_mean_over_the_phases(is_tiled, seed, tile_px, n_slices, tempe
     slow = mean_by_oracle(variables, frame, temperature, seed)
     with jax.enable_x64(True):
         fast = np.asarray(lengths(*float64((variables, frame)), all_pairs(N_SAMPLES, N_LIGHTS), temperature))
-    # 32 points of each sample against 1,000: a pair that half of the phases count is off by 0.03, a sample's 16 by 0.1 (one
-    # standard deviation), the sum of 64 samples by less than 1, of some 400.
+    # 32 points of each sample against 1,000: a pair that half of the phases count is off by 0.03, a sample's 16 by
+    # 0.1 (one standard deviation), the sum of 64 samples by less than 1, of some 400.
     assert np.abs(fast - slow).max() < 0.75
     assert fast.sum() == pytest.approx(slow.sum(), rel=0.01)
 
@@ -167,8 +167,8 @@ def test_the_gradient_is_that_of_central_differences(is_tiled, temperature, seed
             direction *= scale / np.linalg.norm(direction)
             by_gradient = float((np.asarray(getattr(slope, name)) * direction).sum())
             by_difference = difference(variables, frame, pairs, temperature, name, direction, 1e-7)
-            # The gradient of float64 is good to 1e-5; a difference over 1e-7 to 1e-8 of the count. Slopes near zero count as
-            # a thousandth of the count.
+            # The gradient of float64 is good to 1e-5; a difference over 1e-7 to 1e-8 of the count. Slopes near zero
+            # count as a thousandth of the count.
             assert by_gradient == pytest.approx(by_difference, rel=1e-3, abs=1e-6 * count), name
 
 
@@ -180,7 +180,9 @@ def test_a_single_precision_gradient_is_as_good():
         double = gradient(*float64((variables, frame)), pairs, 0.0)
     for name in VARIABLES:
         largest = float(np.abs(getattr(double, name)).max())
-        assert np.abs(np.asarray(getattr(single, name)) - np.asarray(getattr(double, name))).max() < 1e-3 * largest, name
+        assert np.abs(np.asarray(getattr(single, name)) - np.asarray(getattr(double, name))).max() < 1e-3 * largest, (
+            name
+        )
 
 
 @given(seed=seeds, tile_px=tiles, n_slices=slices, is_tiled=st.booleans(), phase=st.tuples(*[st.floats(0, 0.999)] * 3))
@@ -229,7 +231,9 @@ def test_candidates_hold_every_pair_that_counts(is_tiled, seed, tile_px, n_slice
     variables = count_variables(CAMERA, lights, tile_px, None if is_tiled else n_slices)
     frame = relaxed_frame(samples, N_SAMPLES)
     pairs = candidate_pairs(variables, frame, margin=0.1)
-    found = set(zip(*(np.asarray(a)[np.asarray(pairs.in_use)].tolist() for a in (pairs.sample, pairs.light)), strict=True))
+    found = set(
+        zip(*(np.asarray(a)[np.asarray(pairs.in_use)].tolist() for a in (pairs.sample, pairs.light)), strict=True)
+    )
     assert len(found) == np.asarray(pairs.in_use).sum()
     larger = eqx.tree_at(
         lambda v: (v.tile_px_x, v.tile_px_y, v.light_range_m),
@@ -297,7 +301,9 @@ def test_cubic_slices_follow_the_tile():
     variables = count_variables(CAMERA, nearby_lights(surface(0), 1, 0), tile_px=10, depth_slices=0)
     by_hand = math.log(1000) / math.log(1 + 2 * math.tan(math.radians(30)) / 4)  # 4 rows of 10 pixels
     assert variables.depth_slices is not None and float(variables.depth_slices) == pytest.approx(by_hand, rel=1e-6)
-    follows = functools.partial(cubic_depth_slices, near_m=variables.near_m, tan_half_y=variables.tan_half_y, frame=frame)
+    follows = functools.partial(
+        cubic_depth_slices, near_m=variables.near_m, tan_half_y=variables.tan_half_y, frame=frame
+    )
     assert float(follows(variables.tile_px_y)) == pytest.approx(by_hand, rel=1e-5)
     assert float(jax.grad(lambda t: follows(t))(variables.tile_px_y)) < 0
 
