@@ -116,7 +116,6 @@ def expected_lighting_computations(
     - `temperature`: the radius of a light is spread evenly over `1 - temperature` to `1 + temperature` times its
       range: what a cell does at the light's edge falls linearly from counted to not. In [0, 1); 0 is a hard edge.
     """
-
     shares = _shares(variables, frame, temperature)
 
     def add_chunk(total, chunk):
@@ -151,7 +150,6 @@ def lighting_computations_at_phase(
 
     **Returns:** a count of the frame's samples; times `frame.weight`, of the whole image.
     """
-
     screen, rows_of = _screen(variables, frame), _rows(variables, frame)
     height_px = frame.viewport.height_px
 

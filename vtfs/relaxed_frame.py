@@ -27,7 +27,7 @@ _PLASTIC = 1.2207440846057596  # root of x**4 = x + 1: Roberts' sequence in thre
 def relaxed_frame(samples: ViewSamples, n_samples: int = 2048, n_phases: int = 1) -> RelaxedFrame:
     """Samples spread evenly over the image, each with its own points of a low-discrepancy sequence. Deterministic.
 
-    Along a Z-order curve over the valid pixels every so manieth one is taken. For the count of a whole frame more
+    Along a Z-order curve over the valid pixels one in so many is taken. For the count of a whole frame more
     samples are worth more than more phases of each: one is enough; several serve single samples.
 
     **Arguments:**
@@ -113,22 +113,15 @@ def candidate_pairs(
 
     **Raises:** `InputError` for more than 2^28 pairs.
     """
-    with jax.enable_x64(False):
-        single: tuple[CountVariables, RelaxedFrame] = jax.tree.map(
-            lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), (variables, frame)
-        )
-        boxes, spheres = _reaches(*single, np.float32(temperature), np.float32(margin))
-        capacity = 2**18
-        while True:
-            lists = _assigned(boxes, spheres, capacity)
-            if not bool(lists.overflowed):
-                break
-            capacity *= 8
-            if capacity > _LARGEST_PAIRS:
-                raise InputError(f"relaxed count: more than {_LARGEST_PAIRS:,} pairs; take fewer samples.")
-        count = np.asarray(lists.count)
-        n_pairs = int(count.sum(dtype=np.int64))
-        light = np.asarray(lists.index)[:n_pairs]
+    count, light = np.zeros(frame.n_samples, np.int64), np.zeros(0, np.int32)
+    if variables.light_range_m.shape[0]:
+        with jax.enable_x64(False):
+            single: tuple[CountVariables, RelaxedFrame] = jax.tree.map(
+                lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), (variables, frame)
+            )
+            boxes, spheres = _reaches(*single, np.float32(temperature), np.float32(margin))
+            count, light = _lists(boxes, spheres)
+    n_pairs = len(light)
     sample = np.repeat(np.arange(frame.n_samples, dtype=np.int32), count)
     padding = (0, _rounded_up(n_pairs) - n_pairs)
     return CandidatePairs(
@@ -159,6 +152,18 @@ def _reaches(variables: CountVariables, frame: RelaxedFrame, temperature, margin
     range_m = variables.light_range_m
     reach_m = range_m * (1 + temperature + 2 * margin)
     return box, Sphere(jnp.where(range_m > 0, light_x, jnp.inf), light_y, -light_z, reach_m)
+
+
+def _lists(boxes: Aabb, spheres: Sphere) -> tuple[np.ndarray, np.ndarray]:
+    """Lights that meet each box: how many, and which, box after box."""
+    capacity = 2**18
+    while capacity <= _LARGEST_PAIRS:
+        lists = _assigned(boxes, spheres, capacity)
+        if not bool(lists.overflowed):
+            count = np.asarray(lists.count)
+            return count, np.asarray(lists.index)[: count.sum(dtype=np.int64)]
+        capacity *= 8
+    raise InputError(f"relaxed count: more than {capacity // 8:,} pairs; take fewer samples.")
 
 
 @functools.partial(jax.jit, static_argnums=2)
