@@ -84,10 +84,9 @@ class Tracer:
             hits = self._march(scene, planes, rays, np.arange(len(rays.x)), ends_m, only_first=False)
             found[rows.start] = [(ray + first_pixel, triangle, depth_m) for ray, triangle, depth_m in hits]
 
-        if (self._blended if blended else self._solid).is_empty:
-            return np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0)
         by_bands(camera, trace)
-        steps = [step for start in sorted(found) for step in found[start]]
+        nothing = np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0)
+        steps = [nothing, *(step for start in sorted(found) for step in found[start])]
         pixel, triangle, depth_m = (np.concatenate(column) for column in zip(*steps, strict=True))
         order = np.argsort(pixel, kind="stable")
         return pixel[order], triangle[order], depth_m[order]

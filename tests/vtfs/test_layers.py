@@ -41,6 +41,12 @@ def test_a_scene_without_blended_surfaces_has_no_layers():
     assert trace_view_samples(stacked(square(5, SOLID)), FRONT).layers.transparent == ()
 
 
+def test_blended_surfaces_outside_the_view_make_no_layer():
+    behind = replace(FRONT, target_m=(0.0, 0.0, 1.0))
+    samples = trace_view_samples(stacked(square(2, BLEND)), behind)
+    assert samples.layers.transparent == () and samples.layers.hidden == ()
+
+
 def test_hidden_fragments_are_those_that_pass_when_they_are_submitted():
     """5 m passes, 6 m fails, 4 m passes, 3 m passes and is seen, 3.5 m fails."""
     scene = stacked(*(square(depth_m, SOLID) for depth_m in (5, 6, 4, 3, 3.5)))
