@@ -104,6 +104,21 @@ def test_the_chunk_never_changes_a_list_or_a_count(chunk):
     assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), counts, same_counts))
 
 
+def test_without_loops_the_lists_are_the_same(monkeypatch):
+    """What a GPU runs where one step holds everything."""
+    low, high, centre, radius = boxes_and_spheres(200, 3.0, 3)
+    spheres, clusters = as_spheres(centre, radius), clusters_of(low, high)
+    expected, _ = assign(spheres, clusters, CAPACITY, 256, 8)
+    with monkeypatch.context() as patched:
+        patched.setattr(jax, "default_backend", lambda: "gpu")
+        program = jax.jit(lambda s, c: assign_coarse_to_fine(s, c, CAPACITY, 2**16, 8)[0])
+        compiled = program.lower(spheres, clusters).compile()
+    assert " while(" not in compiled.as_text()
+    lists = compiled(spheres, clusters)
+    assert not lists.overflowed and lists.index.shape == (CAPACITY,)
+    assert [a.tolist() for a in lists_of(lists)] == [a.tolist() for a in lists_of(expected)]
+
+
 @pytest.mark.parametrize("capacity", [64, 1024])
 def test_what_does_not_fit_on_any_level_is_said(capacity):
     low, high, centre, radius = boxes_and_spheres(200, 3.0, 3)

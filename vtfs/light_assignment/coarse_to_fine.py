@@ -73,7 +73,7 @@ def assign_coarse_to_fine(
     # Places past the lights are read by lanes that are masked.
     lights = jax.tree.map(lambda column: jnp.pad(column, (0, n_words * WORD_BITS - n_lights)), lights)
 
-    overflowed, words, absent = jnp.bool_(False), [], []
+    overflowed, words, absent, held = jnp.bool_(False), [], [], n_words * WORD_BITS
     for depth, boxes in enumerate(levels):
         n_below = branching ** (len(levels) - 1 - depth)
         n_children = _n_children(-(-clusters.n_clusters // n_below), boxes.shape[0], branching)
@@ -85,8 +85,10 @@ def assign_coarse_to_fine(
         words.append(jnp.sum(n_children * blocks.count, dtype=jnp.int32))
         absent.append(jnp.sum(n_children * (blocks.count * WORD_BITS - count), dtype=jnp.int32))
         room = capacity if depth == len(levels) - 1 else max(capacity // _COARSE_SHARE, WORD_BITS)
-        lists, total = refine(lights, lists, blocks, boxes, room, chunk)
+        most_blocks = held // WORD_BITS + boxes.shape[0]
+        lists, total = refine(lights, lists, blocks, boxes, most_blocks, room, chunk)
         overflowed |= total > room
+        held = room
     n = clusters.key.shape[0]
     counts = AssignCounts(_stack(words[:-1]), _stack(absent[:-1]), words[-1], absent[-1])
     return LightLists(lists.offset[:n], lists.count[:n], lists.light, total, overflowed), counts
@@ -121,6 +123,7 @@ def refine(
     lists: NodeLists,
     blocks: Blocks,
     boxes: Float[Array, "nodes 6 branching"],
+    most_blocks: int,
     capacity: int,
     chunk: int,
 ) -> tuple[NodeLists, Int[Array, ""]]:
@@ -130,8 +133,7 @@ def refine(
 
     **Returns:** the children's lists, and their total length, also where it is more than `capacity`.
     """
-    n_nodes, _, branching = boxes.shape
-    most_blocks = lists.light.shape[0] // WORD_BITS + n_nodes
+    branching = boxes.shape[2]
     hits = _test_blocks(lights, lists, blocks, boxes, most_blocks, chunk)
 
     def words_of(row):
@@ -177,7 +179,9 @@ def _test_blocks(
         there = before[:, None] + lane < lists.count[node][:, None]
         light = lists.light[jnp.where(there, (lists.offset[node] + before)[:, None] + lane, 0)]
         light = jnp.where(there, light, 0)
-        sphere = jax.tree.map(lambda column: column[light][:, None, :], lights)
+        # Loaded before, not within, the tests: a GPU would load each light again for every child.
+        sphere = jax.lax.optimization_barrier(jax.tree.map(lambda column: column[light], lights))
+        sphere = jax.tree.map(lambda column: column[:, None, :], sphere)
         box = boxes[node]
         return pack_bits(
             there[:, None, :] & sphere_meets_box(sphere, Aabb(*(box[:, c, :, None] for c in range(6))))
