@@ -1,6 +1,6 @@
 """Light assignment from 32 to millions of lights: every assigner, the sorts and the stages of a tree's build.
 
-python benchmarks/light_assignment.py [--lights 32,1024,...] [--full] [--bevy PATH]
+python benchmarks/light_assignment.py [--lights 32,1024,...] [--only NAME] [--full] [--bevy PATH]
 
 Without a peer: 1920x1080, 32-pixel tiles, self-similar slices, near 0.1 m, far 200 m, a surface in about 15,600
 clusters, lights in the box of the surface with 20 of them at a median sample. `--full` times the whole update as well:
@@ -35,6 +35,7 @@ from vtfs.gbuffer import Positions, to_runs
 from vtfs.light_assignment.brute_force import assign_brute_force
 from vtfs.light_assignment.coarse_to_fine import assign_coarse_to_fine, n_tests
 from vtfs.light_assignment.light_tree import assign_tree, build_light_tree, light_tree, reduce_lights
+from vtfs.light_lists import LightLists
 from vtfs.lights import scatter_lights
 from vtfs.morton import morton_codes
 from vtfs.sort_keys import SORTS
@@ -42,11 +43,16 @@ from vtfs.sort_keys import SORTS
 VIEWPORT = Viewport(1920, 1080)
 NEAR_M, FAR_M, TILE_PX = 0.1, 200.0, 32
 CELLS, CLUSTERS = 2**20, 2**17
-MOST_BRUTE_FORCE_TESTS = {"cpu": 2**28, "gpu": 2**36}
+MOST_BRUTE_FORCE_TESTS = {"cpu": 2**28}
 SLOWEST_SORT = {"merge_path": {"cpu": 2**16}}
+
+N_BOXES = 750
 
 DENSE = (30, 17, 24)
 DENSE_FIRST_M, DENSE_FAR_M, DENSE_RANGE_M, DENSE_TILE_PX = 5.0, 100.0, 4.0, 64
+
+
+Times = dict[str, float]  # milliseconds by what was timed
 
 
 def on_cpu() -> bool:
@@ -65,12 +71,12 @@ def median_ms(run: Callable[[], object], least_s: float = 0.2, repeats: int = 5)
 
 
 def surface_positions(camera: Camera) -> Positions:
-    """A floor, a far wall and a thousand boxes before them: one smooth depth a box, with steps between."""
+    """A floor, a far wall and many small boxes before them: one smooth depth a box, with steps between."""
     rng = np.random.default_rng(0)
     x, y = camera.pixel_slopes()
     depth_m = np.broadcast_to(np.minimum(FAR_M * 0.9, 2.0 / np.maximum(-y, 1e-3))[:, None], (len(y), len(x))).copy()
     for _ in range(N_BOXES):
-        width, height = rng.integers(16, 160, 2)
+        width, height = rng.integers(8, 96, 2)
         left, top = rng.integers(0, len(x) - width), rng.integers(0, len(y) - height)
         part = np.s_[top : top + height, left : left + width]
         tilt = 1 + 0.3 * rng.normal() * (np.arange(width) / width - 0.5)
@@ -79,9 +85,6 @@ def surface_positions(camera: Camera) -> Positions:
     channels = (x[None, :] * depth_m, y[:, None] * depth_m, -depth_m)
     x_m, y_m, z_m = (jnp.asarray(to_runs(channel.astype(np.float32))) for channel in channels)
     return Positions(x_m, y_m, z_m, jnp.asarray(to_runs(np.ones(depth_m.shape, bool))), camera.viewport)
-
-
-N_BOXES = 1000
 
 
 def lights_around(positions: Positions, n_lights: int) -> Sphere:
@@ -93,34 +96,32 @@ def lights_around(positions: Positions, n_lights: int) -> Sphere:
     return Sphere(*(jnp.asarray(column) for column in columns.T))
 
 
-def fitting_capacity(assign: Callable[[int], object]) -> int:
-    """Powers of two until the lists fit."""
+def fitting_capacity(assign: Callable[[int], LightLists]) -> int:
+    """The smallest power of two with which the lists fit, and the lists of groups before them."""
     capacity = 2**17
-    while bool(assign(capacity).overflowed):  # type: ignore[attr-defined]
-        capacity *= 2
-    return capacity
+    while bool((lists := assign(capacity)).overflowed):
+        capacity *= 8
+    tight = 2 ** (max(int(lists.total), 1) - 1).bit_length()
+    return next(c for c in (tight, 2 * tight, 4 * tight, capacity) if c >= capacity or not assign(c).overflowed)
 
 
-def assigners(capacity: int) -> dict[str, Callable[[Sphere, Clusters], object]]:
+def assigners(capacity: int, only: str) -> dict[str, Callable[[Sphere, Clusters], LightLists]]:
     """From lights and clusters to lists, with whatever is built on the way. Chunks are 2^19 tests on a CPU."""
     words = 2**14 if on_cpu() else 2**22
-    found: dict[str, Callable[[Sphere, Clusters], object]] = {
-        f"coarse to fine, b={b}": lambda s, c, b=b: assign_coarse_to_fine(s, c, capacity, words, b)[0]
-        for b in (16, 32)
+    found: dict[str, Callable[[Sphere, Clusters], LightLists]] = {
+        f"coarse to fine, b={b}": lambda s, c, b=b: assign_coarse_to_fine(s, c, capacity, words, b)[0] for b in (16, 32)
     }
     for b in (8, 32):
         rows = (2**19 if on_cpu() else 2**22) // b
         found[f"tree, b={b}"] = lambda s, c, b=b, rows=rows: assign_tree(light_tree(s, b), c, capacity, rows)[0]
     found["brute force"] = lambda s, c: assign_brute_force(s, c, capacity, 2**14 if on_cpu() else 2**17)[0]
-    return found
+    return {name: assign for name, assign in found.items() if only in name}
 
 
-def print_row(name: str, **values: object) -> None:
-    print(f"  {name:32}" + "  ".join(f"{key} {value}" for key, value in values.items()), flush=True)
-
-
-def time_assigners(lights: Sphere, clusters: Clusters, between: Callable[[], None] = lambda: None) -> int:
-    """Every assigner, and how it differs from the first; returns the capacity."""
+def time_assigners(
+    lights: Sphere, clusters: Clusters, only: str, between: Callable[[], None] = lambda: None
+) -> tuple[Times, int]:
+    """Every assigner, checked against the first; and the capacity of the pairs."""
     n_lights, n_clusters = lights.x_m.shape[0], int(clusters.n_clusters)
     first = jax.jit(
         lambda s, c, capacity: assign_coarse_to_fine(s, c, capacity, 2**14 if on_cpu() else 2**22), static_argnums=2
@@ -129,64 +130,72 @@ def time_assigners(lights: Sphere, clusters: Clusters, between: Callable[[], Non
     lists, counts = first(lights, clusters, capacity)
     coarse, fine = n_tests(counts)
     pairs = int(np.asarray(lists.count, np.int64).sum())
-    print(f"{n_lights:,} lights, {n_clusters:,} clusters, {pairs:,} pairs (capacity {capacity:,})", flush=True)
-    print_row("tests of coarse to fine", coarse=f"{coarse:,}", fine=f"{fine:,}")
-    for name, assign in assigners(capacity).items():
-        if name == "brute force" and n_lights * n_clusters > MOST_BRUTE_FORCE_TESTS.get(jax.default_backend(), 2**36):
+    print(
+        f"{n_lights:,} lights, {n_clusters:,} clusters, {pairs:,} pairs (capacity {capacity:,}); "
+        f"coarse to fine tests {coarse:,} and {fine:,}",
+        flush=True,
+    )
+    brute_force_tests = MOST_BRUTE_FORCE_TESTS.get(jax.default_backend()) or 2**36
+    found: Times = {}
+    for name, assign in assigners(capacity, only).items():
+        if name == "brute force" and n_lights * n_clusters > brute_force_tests:
             continue
         program = jax.jit(assign)
         started = time.perf_counter()
         result = jax.block_until_ready(program(lights, clusters))
         compile_s = time.perf_counter() - started
-        if bool(result.overflowed):  # type: ignore[attr-defined]
-            print_row(name, outcome="a level does not fit the capacity of the pairs")
+        if bool(result.overflowed):
+            print(f"  {name}: a level does not fit the capacity of the pairs", flush=True)
             continue
-        differing = int(np.abs(np.asarray(result.count) - np.asarray(lists.count)).sum())  # type: ignore[attr-defined]
-        ms = median_ms(partial(program, lights, clusters))
-        print_row(name, ms=f"{ms:9.3f}", compile_s=f"{compile_s:5.1f}", other_pairs=differing)
+        differing = int(np.abs(np.asarray(result.count) - np.asarray(lists.count)).sum())
+        found[name] = median_ms(partial(program, lights, clusters))
+        print(f"  {name}: {found[name]:.3f} ms, first call {compile_s:.1f} s, other pairs {differing}", flush=True)
         between()
-    return capacity
+    return found, capacity
 
 
-def time_stages(lights: Sphere) -> None:
+def time_stages(lights: Sphere) -> Times:
     """What a tree's build is made of."""
     n_lights = lights.x_m.shape[0]
     box = jax.jit(reduce_lights)(lights)
     codes = jax.jit(morton_codes)(lights, *box)
     reduce_ms = median_ms(partial(jax.jit(reduce_lights), lights))
-    print_row("stages", reduce=f"{reduce_ms:.3f}", morton=f"{median_ms(partial(jax.jit(morton_codes), lights, *box)):.3f}")
+    found = {"reduce": reduce_ms, "Morton codes": median_ms(partial(jax.jit(morton_codes), lights, *box))}
     order = jax.jit(SORTS["xla"])((codes,))
     for name, sort in SORTS.items():
         if n_lights > SLOWEST_SORT.get(name, {}).get(jax.default_backend(), n_lights):
             continue
         program = jax.jit(sort)
-        same = bool((program((codes,)) == order).all())
-        print_row(f"sort, {name}", ms=f"{median_ms(partial(program, (codes,))):9.3f}", same_order=same)
+        if not bool((program((codes,)) == order).all()):
+            raise SystemExit(f"sort, {name}: not the order of XLA's sort.")
+        found[f"sort, {name}"] = median_ms(partial(program, (codes,)))
     for b in (8, 32):
         program = jax.jit(lambda s, o, b=b: build_light_tree(s, o, b))
-        print_row(f"build, b={b}", ms=f"{median_ms(partial(program, lights, order)):9.3f}")
+        found[f"build, b={b}"] = median_ms(partial(program, lights, order))
+    return found
 
 
-def view_benchmark(counts: list[int], full: bool) -> None:
+def view_benchmark(counts: list[int], only: str, full: bool) -> None:
     camera = Camera((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 60.0, NEAR_M, FAR_M, VIEWPORT)
     positions, grid = surface_positions(camera), cluster_grid(camera, TILE_PX, 0, FAR_M)
     form = jax.jit(lambda p, g: form_clusters(p, g, "implicit", CELLS, CLUSTERS))
     clusters = form(positions, grid)
     assert not bool(clusters.overflowed)
-    print(f"clusters: {int(clusters.n_clusters):,} occupied, {median_ms(partial(form, positions, grid)):.3f} ms\n")
+    print(f"clusters: {int(clusters.n_clusters):,} occupied, {median_ms(partial(form, positions, grid)):.3f} ms")
     # The clusters by themselves: blocks are of no use here, and their capacity is larger.
     n = 2 ** (int(clusters.n_clusters) - 1).bit_length()
     own = jax.tree.map(lambda a: a[:n] if a.ndim == 1 and a.shape[0] == CLUSTERS else a, clusters)
+    table: dict[int, Times] = {}
     for n_lights in counts:
         lights = lights_around(positions, n_lights)
-        capacity = time_assigners(lights, own)
-        time_stages(lights)
+        table[n_lights], capacity = time_assigners(lights, own, only)
+        table[n_lights] |= time_stages(lights)
         if full:
-            for name, assign in assigners(capacity).items():
+            for name, assign in assigners(capacity, only).items():
                 if name != "brute force":
                     update = jax.jit(lambda s, p, g, assign=assign: _update(assign, n, s, p, g))
-                    print_row(f"update, {name}", ms=f"{median_ms(partial(update, lights, positions, grid)):9.3f}")
-        print()
+                    table[n_lights][f"update, {name}"] = median_ms(partial(update, lights, positions, grid))
+    print_table(table)
 
 
 def _update(assign, n: int, lights: Sphere, positions: Positions, grid: ClusterGrid):
@@ -233,21 +242,35 @@ def run_bevy(program: str, lights: Sphere, iterations: int) -> dict:
         return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
-def dense_benchmark(counts: list[int], bevy: str) -> None:
+def dense_benchmark(counts: list[int], only: str, bevy: str) -> None:
     clusters = dense_clusters()
+    table: dict[int, Times] = {}
     for n_lights in counts:
         lights = dense_lights(n_lights)
         iterations = max(5, min(100, 1_000_000 // n_lights))
         peers: list[dict] = []
-        time_assigners(lights, clusters, lambda: peers.append(run_bevy(bevy, lights, iterations)))  # noqa: B023
-        ms = float(np.median([peer["ms_median"] for peer in peers]))
-        print_row(str(peers[0]["peer"]), ms=f"{ms:9.3f}", pairs=f"{peers[0]['pairs']:,}", runs=len(peers))
-        print(flush=True)
+        run_peer = partial(run_bevy, bevy, lights, iterations)
+        table[n_lights], _ = time_assigners(lights, clusters, only, lambda: peers.append(run_peer()))  # noqa: B023
+        table[n_lights][str(peers[0]["peer"])] = float(np.median([peer["ms_median"] for peer in peers]))
+        print(
+            f"  {peers[0]['peer']}: {peers[0]['pairs']:,} pairs, median of {len(peers)} runs between ours", flush=True
+        )
+    print_table(table)
+
+
+def print_table(table: dict[int, Times]) -> None:
+    """One row for each thing timed, one column for each number of lights; milliseconds."""
+    names = list(dict.fromkeys(name for times in table.values() for name in times))
+    print("\n| ms | " + " | ".join(f"{n:,} lights" for n in table) + " |\n|" + " --- |" * (len(table) + 1))
+    for name in names:
+        cells = [f"{times[name]:.3f}" if name in times else "" for times in table.values()]
+        print(f"| {name} | " + " | ".join(cells) + " |")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lights", help="numbers of lights, separated by commas")
+    parser.add_argument("--only", default="", help="assigners whose name holds this")
     parser.add_argument("--full", action="store_true", help="also clusters, build and assignment in one program")
     parser.add_argument("--bevy", help="path of the peer's program: its grid and lights instead")
     arguments = parser.parse_args()
@@ -255,9 +278,9 @@ def main() -> None:
     default = "1000,10000,100000" if arguments.bevy else "32,1024,32768,1048576"
     counts = [int(n) for n in (arguments.lights or default).split(",")]
     if arguments.bevy:
-        dense_benchmark(counts, arguments.bevy)
+        dense_benchmark(counts, arguments.only, arguments.bevy)
     else:
-        view_benchmark(counts, arguments.full)
+        view_benchmark(counts, arguments.only, arguments.full)
 
 
 if __name__ == "__main__":

@@ -146,7 +146,7 @@ def gather_hits(
         return pack_bits(mask), (row,)
 
     columns, total, _ = list_bits(
-        n_rows, words_of, lambda row, bit: emit(*row, bit), n_columns, jnp.zeros(0, jnp.int32), capacity, chunk
+        n_rows, words_of, lambda row, bit: emit(row[0], bit), n_columns, jnp.zeros(0, jnp.int32), capacity, chunk
     )
     return columns, total
 

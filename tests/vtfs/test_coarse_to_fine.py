@@ -113,7 +113,7 @@ def test_without_loops_the_lists_are_the_same(monkeypatch):
         patched.setattr(jax, "default_backend", lambda: "gpu")
         program = jax.jit(lambda s, c: assign_coarse_to_fine(s, c, CAPACITY, 2**16, 8)[0])
         compiled = program.lower(spheres, clusters).compile()
-    assert " while(" not in compiled.as_text()
+    assert " while(" not in str(compiled.as_text())
     lists = compiled(spheres, clusters)
     assert not lists.overflowed and lists.index.shape == (CAPACITY,)
     assert [a.tolist() for a in lists_of(lists)] == [a.tolist() for a in lists_of(expected)]
@@ -163,7 +163,7 @@ def test_tests_are_counted_as_a_loop_counts_them(n_clusters, n_lights):
     assert n_tests(counts) == (n_coarse, n_fine)
 
 
-# --- lists of bits: marks, one step, and the search in windows ---------------------------------------------------------
+# --- lists of bits: marks, one step, and the search in windows ----------------------------------------
 
 
 @pytest.mark.parametrize("most_rows", [None, 64])

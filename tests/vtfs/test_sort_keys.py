@@ -69,7 +69,7 @@ def test_the_devices_method_is_one_of_them():
     assert sorted_order((keys,)).tolist() == [1, 3, 2, 0]
 
 
-# --- what is sorted for the light tree ---------------------------------------------------------------------------------
+# --- what is sorted for the light tree ----------------------------------------
 
 
 @jax.jit
