@@ -16,6 +16,7 @@ from vtfs.clusters import Clusters
 from vtfs.light_assignment.brute_force import box_rows
 from vtfs.light_lists import AssignCounts, LightLists, lists_from_pairs
 from vtfs.morton import morton_codes
+from vtfs.sort_keys import sorted_order
 from vtfs.wide_tree import WideTree, build_tree, in_leaf_nodes, walk
 
 
@@ -45,10 +46,24 @@ def reduce_lights(lights: Sphere) -> tuple[Float[Array, 3], Float[Array, 3]]:
     return jnp.stack(low), jnp.stack(high)
 
 
-def sort_lights(code: UInt32[Array, " lights"]) -> Int[Array, " lights"]:
-    """The lights in order of their codes; equal codes keep their order."""
-    place = jnp.arange(code.shape[0], dtype=jnp.int32)
-    return jax.lax.sort((code, place), num_keys=1, is_stable=True)[1]
+def sort_lights(*code: UInt32[Array, " lights"]) -> Int[Array, " lights"]:
+    """The lights in order of their codes (words, the most significant first); equal codes keep their order."""
+    return sorted_order(code)
+
+
+def order_lights(
+    lights: Sphere, old_order: Int[Array, " lights"], frame: Int[Array, ""], resort_every: Int[Array, ""]
+) -> Int[Array, " lights"]:
+    """Morton order, sorted again in every `resort_every`-th frame only; between them the old order stays.
+
+    Any order is right, as boxes are made anew in every frame: lights that moved far from their neighbours make them
+    larger, and the walk longer. In frame 0 `old_order` is not read.
+    """
+
+    def sort_again():
+        return sort_lights(morton_codes(lights, *reduce_lights(lights)))
+
+    return jax.lax.cond(frame % resort_every == 0, sort_again, lambda: old_order)
 
 
 def build_light_tree(lights: Sphere, order: Int[Array, " lights"], branching: int) -> LightTree:

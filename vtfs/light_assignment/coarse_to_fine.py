@@ -1,0 +1,208 @@
+"""Lights listed for groups of clusters, then for the clusters of each group: nothing is sorted.
+
+The tree is over the clusters and the lights walk down it, where Olsson et al. 2012 (Sec. 3.3) put the lights in a tree
+and walk the clusters down: O(N + hits), as each light is tested only in groups that it reaches. Building is one
+reduction a level, of clusters that are few, instead of codes, a sort and boxes of lights that may be millions.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt32
+
+from vtfs.bit_lists import WORD_BITS, last_not_above, list_bits, pack_bits, starts_of
+from vtfs.bounds import Aabb, Sphere, sphere_meets_box
+from vtfs.clusters import Clusters
+from vtfs.light_lists import AssignCounts, LightLists
+from vtfs.wide_tree import build_tree, in_leaf_nodes, n_leaf_nodes
+
+_WHOLE = 2**21
+"""Words of a level that are tested in one step on a GPU, whatever the chunk."""
+
+
+_COARSE_SHARE = 4
+"""Groups have fewer entries than clusters, and fresh memory is what a CPU spends most on with few lights."""
+
+
+class NodeLists(eqx.Module):
+    """The lights that may reach each node of a level: `light[offset[n] : offset[n] + count[n]]`."""
+
+    light: Int[Array, " entries"]
+    offset: Int[Array, " nodes"]
+    count: Int[Array, " nodes"]
+
+
+class Blocks(eqx.Module):
+    """The lists of a level cut into blocks of 32 lights, one list after the other.
+
+    - `first`, `count`: blocks of each node.
+    - `total`: of all nodes.
+    """
+
+    first: Int[Array, " nodes"]
+    count: Int[Array, " nodes"]
+    total: Int[Array, ""]
+
+
+def assign_coarse_to_fine(
+    lights: Sphere, clusters: Clusters, capacity: int, chunk: int, branching: int = 32
+) -> tuple[LightLists, AssignCounts]:
+    """Refine the list of all lights to lists of groups of `branching` consecutive clusters, and those to clusters.
+
+    Clusters are in order of their keys, so that a group is a piece of a row of tiles. Any boxes will do. Lights are
+    listed in ascending order.
+
+    **Arguments:**
+
+    - `capacity`: of the lists on any level.
+    - `chunk`: words of 32 tests made at once.
+
+    **Returns:**
+
+    Lists, and as counts words of 32 lights tested on each level and, as `short`, the lanes of them that hold no
+    light: see `n_tests`.
+    """
+    levels = cluster_levels(clusters, branching)
+    n_lights = lights.x_m.shape[0]
+    n_words = n_leaf_nodes(n_lights, WORD_BITS)
+    everyone = jnp.arange(n_words * WORD_BITS, dtype=jnp.int32)
+    lists = NodeLists(everyone, jnp.zeros(1, jnp.int32), jnp.full(1, n_lights, jnp.int32))
+    # Places past the lights are read by lanes that are masked.
+    lights = jax.tree.map(lambda column: jnp.pad(column, (0, n_words * WORD_BITS - n_lights)), lights)
+
+    overflowed, words, absent, held = jnp.bool_(False), [], [], n_words * WORD_BITS
+    for depth, boxes in enumerate(levels):
+        n_below = branching ** (len(levels) - 1 - depth)
+        n_children = _n_children(-(-clusters.n_clusters // n_below), boxes.shape[0], branching)
+        # A list that is not whole is not refined.
+        count = jnp.where(overflowed | (n_children == 0), 0, lists.count[: boxes.shape[0]])
+        lists = NodeLists(lists.light, lists.offset[: boxes.shape[0]], count)
+        first, total = starts_of(-(-count // WORD_BITS))
+        blocks = Blocks(first, -(-count // WORD_BITS), total)
+        words.append(jnp.sum(n_children * blocks.count, dtype=jnp.int32))
+        absent.append(jnp.sum(n_children * (blocks.count * WORD_BITS - count), dtype=jnp.int32))
+        room = capacity if depth == len(levels) - 1 else max(capacity // _COARSE_SHARE, WORD_BITS)
+        most_blocks = held // WORD_BITS + boxes.shape[0]
+        lists, total = refine(lights, lists, blocks, boxes, most_blocks, room, chunk)
+        overflowed |= total > room
+        held = room
+    n = clusters.key.shape[0]
+    counts = AssignCounts(_stack(words[:-1]), _stack(absent[:-1]), words[-1], absent[-1])
+    return LightLists(lists.offset[:n], lists.count[:n], lists.light, total, overflowed), counts
+
+
+def n_tests(counts: AssignCounts) -> tuple[int, int]:
+    """Tests of (group, light) pairs on all levels, and of (cluster, light) pairs; host integers."""
+    words, absent = np.asarray(counts.node_rows, np.int64), np.asarray(counts.short_rows, np.int64)
+    coarse = int(words.sum()) * WORD_BITS - int(absent.sum())
+    return coarse, int(counts.leaf_rows) * WORD_BITS - int(counts.short_leaf_rows)
+
+
+def cluster_levels(clusters: Clusters, branching: int) -> list[Float[Array, "nodes 6 branching"]]:
+    """Boxes of the children of each node, one row a node, level by level from the root; the last are the clusters'.
+
+    Children that are absent have empty boxes.
+    """
+    used = jnp.arange(clusters.key.shape[0]) < clusters.n_clusters
+    box = clusters.box
+    lows = [jnp.where(used, low, jnp.inf) for low in (box.low_x_m, box.low_y_m, box.low_z_m)]
+    highs = [jnp.where(used, high, -jnp.inf) for high in (box.high_x_m, box.high_y_m, box.high_z_m)]
+    tree = build_tree(Aabb(*lows, *highs), branching)
+    rows = [in_leaf_nodes(low, branching, jnp.inf) for low in lows]
+    rows += [in_leaf_nodes(high, branching, -jnp.inf) for high in highs]
+    ends = np.cumsum(tree.level_nodes)
+    inner = [tree.children[end - n : end] for end, n in zip(ends, tree.level_nodes, strict=True)]
+    return [*inner, jnp.stack(rows, axis=1)]
+
+
+def refine(
+    lights: Sphere,
+    lists: NodeLists,
+    blocks: Blocks,
+    boxes: Float[Array, "nodes 6 branching"],
+    most_blocks: int,
+    capacity: int,
+    chunk: int,
+) -> tuple[NodeLists, Int[Array, ""]]:
+    """Lists of the children from those of their parents.
+
+    Lights are loaded once for all children of a node: loading costs a CPU more than testing.
+
+    **Returns:** the children's lists, and their total length, also where it is more than `capacity`.
+    """
+    branching = boxes.shape[2]
+    hits = _test_blocks(lights, lists, blocks, boxes, most_blocks, chunk)
+
+    def words_of(row):
+        """Row after row: the children of a node, the blocks of a child."""
+        node = last_not_above(blocks.first * branching, row)
+        n_blocks = jnp.maximum(blocks.count[node], 1)
+        within = row - blocks.first[node] * branching
+        child = jnp.minimum(within // n_blocks, branching - 1)
+        block = within - child * n_blocks
+        word = hits[jnp.minimum(blocks.first[node] + block, most_blocks - 1), child]
+        return jnp.where(row < n_rows, word, 0)[:, None], (lists.offset[node] + block * WORD_BITS,)
+
+    n_rows = blocks.total * branching
+    mark = (blocks.first * branching)[:, None] + jnp.arange(branching) * blocks.count[:, None]
+    (light,), total, offset = list_bits(
+        n_rows,
+        words_of,
+        lambda first, bit: (lists.light[first[0] + bit],),
+        1,
+        mark.reshape(-1),
+        capacity,
+        chunk,
+        most_blocks * branching,
+    )
+    return NodeLists(light, offset, jnp.diff(offset, append=total)), total
+
+
+def _test_blocks(
+    lights: Sphere,
+    lists: NodeLists,
+    blocks: Blocks,
+    boxes: Float[Array, "nodes 6 branching"],
+    most_blocks: int,
+    chunk: int,
+) -> UInt32[Array, "blocks branching"]:
+    """Which lights of each block meet each child of its node: bit `l` for the `l`-th light."""
+    branching = boxes.shape[2]
+    lane = jnp.arange(WORD_BITS, dtype=jnp.int32)
+
+    def test(block):
+        node = last_not_above(blocks.first, block)
+        before = (block - blocks.first[node]) * WORD_BITS
+        there = before[:, None] + lane < lists.count[node][:, None]
+        light = lists.light[jnp.where(there, (lists.offset[node] + before)[:, None] + lane, 0)]
+        light = jnp.where(there, light, 0)
+        # Loaded before, not within, the tests: a GPU would load each light again for every child.
+        sphere = jax.lax.optimization_barrier(jax.tree.map(lambda column: column[light], lights))
+        sphere = jax.tree.map(lambda column: column[:, None, :], sphere)
+        box = boxes[node]
+        return pack_bits(
+            there[:, None, :] & sphere_meets_box(sphere, Aabb(*(box[:, c, :, None] for c in range(6))))
+        ).reshape(-1, branching)
+
+    if jax.default_backend() != "cpu" and most_blocks * branching <= max(chunk, _WHOLE):
+        return test(jnp.arange(most_blocks, dtype=jnp.int32))
+    step = max(chunk // branching, 1)
+
+    def test_chunk(state):
+        first, hits = state
+        words = test(first + jnp.arange(step, dtype=jnp.int32))
+        return first + step, jax.lax.dynamic_update_slice(hits, words, (first, 0))
+
+    empty = jax.lax.empty((most_blocks + step, branching), jnp.uint32)
+    return jax.lax.while_loop(lambda state: state[0] < blocks.total, test_chunk, (jnp.int32(0), empty))[1]
+
+
+def _n_children(n_below: Int[Array, ""], n_nodes: int, branching: int) -> Int[Array, " nodes"]:
+    return jnp.clip(n_below - jnp.arange(n_nodes, dtype=jnp.int32) * branching, 0, branching)
+
+
+def _stack(values: list[Int[Array, ""]]) -> Int[Array, " values"]:
+    return jnp.stack(values) if values else jnp.zeros(0, jnp.int32)
