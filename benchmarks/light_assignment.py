@@ -217,7 +217,7 @@ def dense_clusters() -> Clusters:
     key = jnp.arange(n, dtype=jnp.int32)
     zeros, count = jnp.zeros(n, jnp.int32), jnp.int32(n)
     box = cell_boxes(grid, VIEWPORT, key)
-    return Clusters(key, box, count, zeros, zeros, count, jnp.zeros((1, 32), jnp.int32), jnp.bool_(False))
+    return Clusters(key, box, count, zeros, zeros, count, count, jnp.zeros((1, 32), jnp.int32), jnp.bool_(False))
 
 
 def dense_lights(n_lights: int) -> Sphere:

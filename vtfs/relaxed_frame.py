@@ -171,7 +171,7 @@ def _assigned(boxes: Aabb, spheres: Sphere, capacity: int):
     n = boxes.low_x_m.shape[0]
     nothing = jnp.zeros(n, jnp.int32)
     no = jnp.bool_(False)
-    clusters = Clusters(nothing, boxes, jnp.int32(n), nothing, nothing, jnp.int32(n), nothing, no)
+    clusters = Clusters(nothing, boxes, jnp.int32(n), nothing, nothing, jnp.int32(n), jnp.int32(n), nothing, no)
     return assign_tree(light_tree(spheres, _BRANCHING), clusters, capacity, min(capacity, 2**16))[0]
 
 

@@ -8,13 +8,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests import oracles
-from tests.strategies import LIGHT_KINDS, a_camera, adversarial_lights, cameras, random_samples, seeds
+from tests.strategies import LIGHT_KINDS, a_camera, adversarial_lights, cameras, positions_of, random_samples, seeds
 from tests.vtfs.test_light_assignment import as_spheres, boxes_and_spheres, clusters_of, lists_of
 from vtfs.bit_lists import last_not_above_in_order, list_bits, n_bits_set, pack_bits
 from vtfs.bounds import Aabb
 from vtfs.cluster_grid import cluster_grid, n_cells
 from vtfs.clusters import Clusters, form_clusters
-from vtfs.gbuffer import positions_on_device
 from vtfs.light_assignment.brute_force import assign_brute_force
 from vtfs.light_assignment.coarse_to_fine import assign_coarse_to_fine, n_tests
 from vtfs.light_lists import view_lights
@@ -34,6 +33,7 @@ def with_unused(clusters, n_clusters):
         clusters.block_run,
         clusters.block_cluster,
         clusters.n_blocks,
+        clusters.n_solid_blocks,
         clusters.block_of_sample,
         clusters.overflowed,
     )
@@ -62,7 +62,7 @@ def brute_force_and_refined(camera, tile_px, bounds, kinds, seed):
     samples = random_samples(camera, seed)
     spheres = view_lights(adversarial_lights(samples, 200, kinds, seed), camera).spheres(jnp.float32(0))
     grid = cluster_grid(camera, tile_px, 24, camera.near_m * 1e4)
-    positions = positions_on_device(samples)
+    positions = positions_of(samples)
     cells = 2**17
     assert n_cells(grid, camera.viewport) <= cells
     clusters = form(positions, grid, bounds, cells, 1024)
@@ -141,7 +141,9 @@ def test_more_tests_than_32_bits_count_are_not_taken_for_none():
     n = 2**18
     zeros, whole = jnp.zeros(n), jnp.zeros(n, jnp.int32)
     box = Aabb(zeros, zeros, zeros, zeros, zeros, zeros)
-    clusters = Clusters(whole, box, jnp.int32(n), whole, whole, jnp.int32(n), whole[None], jnp.bool_(False))
+    clusters = Clusters(
+        whole, box, jnp.int32(n), whole, whole, jnp.int32(n), jnp.int32(n), whole[None], jnp.bool_(False)
+    )
     lists, _ = assign(as_spheres(np.zeros((n, 3), np.float32), np.ones(n, np.float32)), clusters, 1024, 1024, 32)
     assert bool(lists.overflowed)
 

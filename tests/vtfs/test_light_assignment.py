@@ -204,7 +204,7 @@ def clusters_of(low, high):
     zeros = jnp.zeros(len(low), jnp.int32)
     box = Aabb(*(jnp.asarray(a[:, c]) for a in (low, high) for c in range(3)))
     n = jnp.int32(len(low))
-    return Clusters(zeros, box, n, zeros, zeros, n, jnp.zeros((1, 32), jnp.int32), jnp.bool_(False))
+    return Clusters(zeros, box, n, zeros, zeros, n, n, jnp.zeros((1, 32), jnp.int32), jnp.bool_(False))
 
 
 def as_spheres(centre, radius):
@@ -281,7 +281,9 @@ def test_more_tests_than_32_bits_count_are_not_taken_for_none():
     n = 2**18
     zeros, whole = jnp.zeros(n), jnp.zeros(n, jnp.int32)
     box = Aabb(zeros, zeros, zeros, zeros, zeros, zeros)
-    clusters = Clusters(whole, box, jnp.int32(n), whole, whole, jnp.int32(n), whole[None], jnp.bool_(False))
+    clusters = Clusters(
+        whole, box, jnp.int32(n), whole, whole, jnp.int32(n), jnp.int32(n), whole[None], jnp.bool_(False)
+    )
     try:
         lists, _ = jax.jit(assign_brute_force, static_argnums=(2, 3))(
             Sphere(zeros, zeros, zeros, zeros + 1), clusters, 1024, 1024
