@@ -54,7 +54,8 @@ def json_object(text: str, where: str) -> dict[str, Any]:
         value = json.loads(text)
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
-        cut = "; the file seems cut off" if not text[error.pos :].strip() else ""
+        is_cut = error.msg.startswith("Unterminated string") or not text[error.pos :].strip()
+        cut = "; the end seems cut off" if is_cut else ""
         raise InputError(f"{where}: is not JSON ({error.msg}, {place}){cut}; write it again.") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: cannot be read as JSON ({_reason(error)}); write it again.") from error

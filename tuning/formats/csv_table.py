@@ -240,7 +240,10 @@ def write_csv(path: Path | str, table: TimingTable) -> None:
         if name in columns:
             raise InputError(f"{path}: a column is called `{name}`, as the times are here; rename it.")
     text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
+    # A lone carriage return ends a line when read, and Python 3.11 does not quote it by itself.
+    has_returns = any("\r" in cell for column in table.labels.values() for cell in column)
+    quoting = csv.QUOTE_NONNUMERIC if has_returns else csv.QUOTE_MINIMAL
+    writer = csv.writer(text, lineterminator="\n", quoting=quoting)
     writer.writerow([*columns, *extra])
     for row, repeats in enumerate(table.repeats_ms):
         values = [column[row] for column in columns.values()]

@@ -86,8 +86,8 @@ def write_kernel_tuner(path: Path | str, table: TimingTable) -> None:
         }
         cache[key] = entry
     content = {
-        "device_name": of_run.get("device", "unknown"),
-        "kernel_name": of_run.get("kernel", "frame"),
+        "device_name": of_run.get("device"),
+        "kernel_name": of_run.get("kernel"),
         "problem_size": "",
         "tune_params_keys": list(columns),
         "tune_params": {
