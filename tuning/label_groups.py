@@ -9,21 +9,31 @@ from tuning.timing_table import TimingTable
 
 
 def fit_groups(table: TimingTable, seed: int = 0) -> TableModel:
-    """`fit_table` on each combination of labels by itself, with the columns that any of its rows has a number in.
+    """`fit_table`, also where a column is empty in all rows of a combination of labels (stages aside): it is left out
+    there.
 
     **Raises:** `InputError` as `fit_table`; so for a column that only some rows of a combination have.
     """
-    models = {}
-    for rows in _rows_by_label(table.labels, len(table)):
-        models |= fit_table(
+    if not any(np.isnan(column).any() for column in table.columns.values()):
+        return fit_table(table, seed)
+    # Stages stay together: a frame may be modelled as their sum.
+    apart = {name: label for name, label in table.labels.items() if name != "stage"}
+    parts = [
+        fit_table(
             TimingTable(
                 _present(table.columns, rows),
                 {name: tuple(label[row] for row in rows) for name, label in table.labels.items()},
                 tuple(table.repeats_ms[row] for row in rows),
             ),
             seed,
-        ).models
-    return TableModel(tuple(table.labels), models)
+        )
+        for rows in _rows_by_label(apart, len(table))
+    ]
+    return TableModel(
+        tuple(table.labels),
+        {key: one for part in parts for key, one in part.models.items()},
+        {key: one for part in parts for key, one in part.sums.items()},
+    )
 
 
 def predict_groups(model: TableModel, table: TimingTable) -> tuple[Prediction, ...]:

@@ -17,6 +17,7 @@ from tuning.time_model import COVERAGE, TimeModel
 from tuning.timing_table import TimingTable
 
 _MOST_LEFT_OUT = 3
+_MOST_MESSAGES = 5
 _MOST_PREDICTIONS = 40
 
 
@@ -61,8 +62,10 @@ def print_models(model: TableModel) -> None:
     console = Console()
     (console if console.is_terminal else Console(width=200)).print(table)
     print("error: mean error of rows that were left out of the fit, relative")
-    for message in messages:
+    for message in list(messages)[:_MOST_MESSAGES]:
         print(f"note: {message}")
+    if len(messages) > _MOST_MESSAGES:
+        print(f"{len(messages) - _MOST_MESSAGES} more notes: --json FILE holds all")
 
 
 def predictions_json(predictions: Sequence[Prediction]) -> dict[str, list[dict[str, Any]]]:
