@@ -28,6 +28,9 @@ from vtfs.files import write_atomically
 from vtfs.input_error import InputError
 from vtfs.parameters import PARAMETERS, TECHNIQUES, Configuration, configuration
 
+_DROPPED = 8
+"""Terms that a model does without and that are named, those that would help most first."""
+
 _NEXT = 5
 """Configurations that are named as worth timing next."""
 
@@ -55,20 +58,17 @@ def tune_imported(
     """
     started = time.perf_counter()
     measurements = {c: _measurement(imported, c, seed) for c in imported.repeats_ms}
-    table = _table(imported)
-    model = fit_groups(table, seed)
-    predicted = _predicted(imported, model, objective)
     exact = [c for c in measurements if _is_exact(c)]
     if not exact:
         raise InputError(
             f"{imported.source}: only settings that change the image were timed; time one with gbuffer float32 and "
             "light_cutoff 0."
         )
+    model = fit_groups(_table(imported), seed)
+    predicted = _predicted(imported, model, objective)
     fastest = min(exact, key=lambda c: time_ms(measurements[c], objective))
     fastest_ms = time_ms(measurements[fastest], objective)
-    untimed = sorted(
-        (e for c, e in predicted.items() if c not in measurements and _is_exact(c)), key=lambda e: e.time_ms
-    )
+    untimed = sorted((e for c, e in predicted.items() if c not in measurements), key=lambda e: e.time_ms)
     sure = [
         e
         for e in untimed
@@ -132,8 +132,11 @@ def tune_imported(
 
 
 def _table(imported: ImportedTimes) -> TimingTable:
-    """A row for each frame of each timed configuration: counts that another engine pays for too, else parameters."""
-    rows = [(c, i) for c in imported.repeats_ms for i in range(len(imported.frames))]
+    """A row for each frame of each timed configuration: counts that another engine pays for too, else parameters.
+
+    Settings that change the image change what an operation costs: they are not fitted, nor predicted.
+    """
+    rows = [(c, i) for c in imported.repeats_ms if _is_exact(c) for i in range(len(imported.frames))]
     columns = _features(imported, rows)
     return TimingTable(
         columns, {"technique": tuple(c.technique for c, _ in rows)}, tuple(imported.repeats_ms[c][i] for c, i in rows)
@@ -151,9 +154,9 @@ def _features(imported: ImportedTimes, rows: Sequence[tuple[Configuration, int]]
 
 
 def _predicted(imported: ImportedTimes, model: TableModel, objective: Objective) -> dict[Configuration, Estimate]:
-    """Of every configuration of a technique that was timed."""
-    known = {c.technique for c in imported.repeats_ms}
-    configs = [c for c in imported.counts if c.technique in known]
+    """Of every exact configuration of a technique that was timed."""
+    known = {c.technique for c in imported.repeats_ms if _is_exact(c)}
+    configs = [c for c in imported.counts if c.technique in known and _is_exact(c)]
     rows = [(c, i) for c in configs for i in range(len(imported.frames))]
     labels = {"technique": tuple(c.technique for c, _ in rows)}
     table = TimingTable(_features(imported, rows), labels, ((math.nan,),) * len(rows))
@@ -166,7 +169,9 @@ def _over_frames(config: Configuration, frames: Sequence[Prediction], objective:
     """The slowest frame's prediction, or the mean of all; its interval is that of frames which err together."""
     ends = np.array([[p.time_ms, p.low_ms, p.high_ms] for p in frames])
     time, low, high = ends.max(axis=0) if objective == "max" else ends.mean(axis=0)
-    return Estimate(config, float(time), (float(low), float(high)), any(p.extrapolated for p in frames))
+    # Of the slowest frame only those count that may be it.
+    deciding = [p for p in frames if objective == "mean" or p.high_ms >= time]
+    return Estimate(config, float(time), (float(low), float(high)), any(p.extrapolated for p in deciding))
 
 
 def _measurement(imported: ImportedTimes, config: Configuration, seed: int) -> Measurement:
@@ -225,7 +230,7 @@ def _cost_models(model: TableModel) -> list[dict[str, Any]]:
                 "stage": "frame",
                 "text": one.law.text,
                 "terms": [name for name in coefficients if name != "fixed_ms"],
-                "dropped": [{"term": left.term, "loo_error": _finite(left.error)} for left in one.left_out],
+                "dropped": [{"term": left.term, "loo_error": _finite(left.error)} for left in one.left_out[:_DROPPED]],
                 "coefficients": coefficients,
                 "loo_error": _finite(one.error),
                 "constant_loo_error": _finite(one.constant_error),
