@@ -57,6 +57,7 @@ def fit(
     from tuning.label_groups import fit_groups
     from tuning.published.tables import DEFAULT, read_published
     from tuning.transferable import explaining_columns
+    from vtfs.device import keep_compiled_programs
 
     notes = []
     if data is None:
@@ -72,6 +73,7 @@ def fit(
             f"{table.n_untimed} {'row has' if table.n_untimed == 1 else 'rows have'} no time, and were skipped."
         )
     table = chosen_rows(table, where)
+    keep_compiled_programs()
     with Status() as status:
         status.say(f"fitting {len(table)} rows")
         model = fit_groups(table, seed)

@@ -35,7 +35,9 @@ def recommend_imported(
     if techniques is not None:
         imported = imported.limited_to(techniques)
     from reports.page import write_report
+    from vtfs.device import keep_compiled_programs
 
+    keep_compiled_programs()
     command = shlex.join(["vtfs", *sys.argv[1:]])
     name = Path(scene.scene).stem if scene.scene else None
     with Status() as status:
