@@ -82,7 +82,7 @@ def tune_imported(
     result: dict[str, Any] = {
         "schema": 1,
         "command": command,
-        "claim": imported.claim,
+        "claim": imported.claim if best["timed"] else f"predicted and not timed yet, {imported.claim}",
         "imported": {
             "file": imported.source,
             "timed": len(measurements),

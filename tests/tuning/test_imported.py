@@ -135,6 +135,7 @@ def test_a_tile_size_that_was_never_timed_is_recommended_where_the_model_is_sure
 def test_the_result_says_that_times_were_imported(tuned):
     _, result = tuned
     assert "imported from counts.csv" in result["claim"] and "timed nothing" in result["claim"]
+    assert result["claim"].startswith("predicted and not timed yet")
     assert result["imported"]["timed"] == 5 and result["imported"]["untimed"] == 3
     assert result["compiled_programs"] == 0 and result["measured"] == 5 and result["space_size"] == 8
     assert result["scene"] == {

@@ -59,6 +59,8 @@ def read_extra_p(path: Path | str, metric: str | None = None, unit: str | None =
 def write_extra_p(path: Path | str, table: TimingTable) -> None:
     """Write a line for each row, its repeats as the list `value`; labels as the call path `name=value->name=value`.
 
+    Extra-P itself (4.2.5) reads only files in which every call path was measured at every point.
+
     **Raises:** `InputError` where a row has no number in a column, as Extra-P needs all parameters in all lines, or
     the file cannot be written.
     """
