@@ -68,6 +68,16 @@ def test_predictions_can_be_read_on_a_terminal(model, engine):
     assert ran.code == 0 and "extrapolated" in ran.out and ran.out.count("\n") == 14
 
 
+def test_a_label_that_looks_like_a_number_stays_one(tmp_path):
+    (tmp_path / "t.csv").write_text("build,ms\n12,1\n12,1.01\n13,2\n13,2.02\n")
+    (tmp_path / "map.toml").write_text('labels = ["build"]\n')
+    model = tmp_path / "model.json"
+    assert "2 models" in vtfs("fit", tmp_path / "t.csv", "--map", tmp_path / "map.toml", "--json", model).out
+    (tmp_path / "new.csv").write_text("build\n13\n12\n")
+    found = vtfs("predict", model, tmp_path / "new.csv", "--json", "-").json["predictions"]
+    assert [entry["time_ms"] for entry in found] == pytest.approx([2.01, 1.005], rel=0.01)
+
+
 def test_a_published_table_is_fitted_offline(tmp_path):
     ran = vtfs("fit", "--published", "olsson_2012", "--where", "technique=tiled_brute_force")
     assert ran.code == 0 and "4 rows, 1 model" in ran.out and "lights" in ran.out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -38,7 +39,9 @@ def predict(
 
     model = TableModel.from_json(read_json(model_file))
     is_csv = (format_name or recognised(data)) == "csv"
-    table = read_features(data, layout) if is_csv else read_table(data, layout, format_name)
+    # What was text in the fitted table is text here, also where it looks like numbers.
+    features = replace(layout, labels=(*layout.labels, *model.label_names))
+    table = read_features(data, features) if is_csv else read_table(data, layout, format_name)
     predictions = predict_groups(model, table)
     if out is not None:
         from vtfs.files import write_atomically
