@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tuning.formats import bounded_text
@@ -67,8 +67,12 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("formats")
 
 
+RETURNS = TimingTable({"row": np.array([0.0])}, {"scene": ("a\rb",)}, ((1.0,),))
+
+
 @settings(max_examples=60, deadline=None)
 @given(table=tables())
+@example(table=RETURNS)
 def test_csv_loses_nothing(folder, table):
     path = folder / "table.csv"
     write_csv(path, table)

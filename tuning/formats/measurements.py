@@ -45,4 +45,4 @@ def read_measurements(path: Path | str) -> TimingTable:
         raise InputError(f"{path}: holds no configuration that was timed; measure some with vtfs tune.")
     names = dict.fromkeys(name for record in records for name in record)
     columns = {name: [record.get(name) for record in records] for name in names}
-    return grouped(columns, repeats_ms, compile_ms, n_untimed)
+    return grouped(columns, repeats_ms, compile_ms if any(compile_ms) else None, n_untimed)
