@@ -88,8 +88,12 @@ def test_t4_loses_nothing(folder, table):
     assert recognised(folder / "table.json") == "t4"
 
 
+COMMAS = TimingTable({}, {"a": ("x,y", "x"), "b": ("z", "y,z")}, ((1.0,), (2.0,)))
+
+
 @settings(max_examples=60, deadline=None)
 @given(table=tables(), device=texts)
+@example(table=COMMAS, device="a GPU")
 def test_a_kernel_tuner_cache_loses_nothing(folder, table, device):
     labels = table.labels | {"device": (device,) * len(table)}
     table = TimingTable(table.columns, labels, table.repeats_ms, table.compile_ms)
