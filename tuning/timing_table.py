@@ -11,14 +11,19 @@ import numpy as np
 class TimingTable:
     """One row for each configuration (or frame) that was timed.
 
-    - `columns`: numbers a time may depend on, float64 `[rows]` each: sizes, counts, parameters.
+    - `columns`: numbers a time may depend on, float64 `[rows]` each: sizes, counts, parameters. NaN where a row has
+      none, as a technique without tiles has no tile size.
     - `labels`: columns of text: technique, stage, scene, device.
     - `repeats_ms`: the repeats of each row, at least one; one time where only a median or mean is known.
+    - `compile_ms`: what compiling each row took, where the file says.
+    - `n_untimed`: rows of the file that had no time and are left out.
     """
 
     columns: dict[str, np.ndarray]
     labels: dict[str, tuple[str, ...]]
     repeats_ms: tuple[tuple[float, ...], ...]
+    compile_ms: tuple[float, ...] | None = None
+    n_untimed: int = 0
 
     def __len__(self) -> int:
         return len(self.repeats_ms)

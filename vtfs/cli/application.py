@@ -7,8 +7,11 @@ from typing import Any, NoReturn
 
 import typer
 
+from vtfs.cli.convert import convert
 from vtfs.cli.count import count
+from vtfs.cli.fit import fit
 from vtfs.cli.listings import doctor, scenes, techniques
+from vtfs.cli.predict import predict
 from vtfs.cli.render import render
 from vtfs.cli.report import report
 from vtfs.cli.tune import tune
@@ -23,7 +26,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-for _command in (tune, count, render, report, scenes, techniques, doctor):
+for _command in (tune, count, render, fit, predict, convert, report, scenes, techniques, doctor):
     app.command()(_command)
 
 _UsageError: Any = typer.BadParameter.__mro__[1]

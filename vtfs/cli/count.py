@@ -10,7 +10,6 @@ import typer
 from vtfs.cli.options import (
     JsonOption,
     SetOption,
-    TechniqueOption,
     VerboseOption,
     check_folder,
     parsed_configuration,
@@ -20,12 +19,15 @@ from vtfs.cli.options import (
 from vtfs.cli.scene_arguments import SceneArguments, with_scene
 from vtfs.cli.status import Status
 from vtfs.input_error import InputError
+from vtfs.parameters import TECHNIQUES
 
 
 @with_scene
 def count(
     scene: SceneArguments,
-    technique: TechniqueOption = "tiled_deferred",
+    technique: Annotated[
+        str, typer.Option(help=f"One of {', '.join(TECHNIQUES)}; with --space several, comma-separated.")
+    ] = "tiled_deferred",
     settings: SetOption = None,
     frame: Annotated[
         list[int] | None, typer.Option(help="Only this frame of the path. Repeatable.", show_default="all")
@@ -39,7 +41,10 @@ def count(
 ) -> None:
     """Exact counts for every frame, or for every configuration of a space."""
     set_log_level(verbose)
-    config = parsed_configuration(technique, settings)
+    names = tuple(dict.fromkeys(name.strip() for name in technique.split(","))) if space else (technique,)
+    for name in names[1:]:
+        parsed_configuration(name, settings)
+    config = parsed_configuration(names[0], settings)
     if out and not space:
         raise InputError(
             "--out goes with --space: it is the table of a space's counts; use --json for one configuration."
@@ -50,7 +55,7 @@ def count(
     if space:
         from tuning.space import load_space
 
-        configs = load_space(space, (technique,)).configurations()
+        configs = load_space(space, names).configurations()
     setup = scene.set_up()
     frames = tuple(dict.fromkeys(frame)) if frame else tuple(range(setup.n_frames))
     from vtfs.count_table import count_frames, counts_csv, print_counts

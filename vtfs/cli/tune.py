@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from vtfs.cli.imported import recommend_imported
 from vtfs.cli.options import JsonOption, VerboseOption, check_folder, set_log_level, write_json
 from vtfs.cli.scene_arguments import SceneArguments, with_scene
 from vtfs.cli.status import Status
@@ -41,6 +42,14 @@ def tune(
             show_default="exact settings only",
         ),
     ] = None,
+    measurements: Annotated[
+        Path | None,
+        typer.Option(
+            help="Recommend from times measured elsewhere, and measure nothing: the table of `vtfs count --out` with a "
+            "column time_ms, or a measurements.jsonl.",
+            metavar="FILE",
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the report.", metavar="DIR")] = Path("vtfs-report"),
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the measurements that are in the folder.")
@@ -55,6 +64,12 @@ def tune(
         raise InputError(f"--objective {objective}: must be max or mean.")
     if max_error is not None and not max_error >= 0:
         raise InputError(f"--max-error {max_error}: must be 0 or more.")
+    if measurements is not None:
+        for name, given in (("--budget", budget), ("--space", space), ("--max-error", max_error), ("--resume", resume)):
+            if given not in (None, False):
+                raise InputError(f"{name}: goes without --measurements, which measures nothing; leave one of them out.")
+        recommend_imported(measurements, scene, names if techniques else None, objective, out, json_file)
+        return
     from tuning.space import load_space
     from tuning.sweep import Budget
     from vtfs.device import keep_compiled_programs
