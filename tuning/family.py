@@ -22,6 +22,7 @@ STAGES = {"build_bvh": "build_tree", "assign_lights": "assign", "light_culling":
 """Names that publications use for our stages."""
 
 _MOST_KNOTS = 6
+_FEWEST_VALUES = 10
 _MOST_PRODUCTS = 400
 
 
@@ -79,10 +80,10 @@ def _products(usable: Mapping[str, np.ndarray]) -> list[Term]:
 
 
 def _cut(name: str, column: np.ndarray) -> list[Term]:
-    """Cut at values that leave at least three rows' values on either side."""
+    """Cut at values that leave at least three on either side; not where there are few to tell a cut from a curve."""
     values = np.unique(column)
     inner = values[2:-3]
-    if not len(inner):
+    if len(values) < _FEWEST_VALUES:
         return []
     knots = inner[np.unique(np.linspace(0, len(inner) - 1, _MOST_KNOTS).round().astype(int))]
     return [Term((Factor(name),), shape, float(k)) for k in knots for shape in ("up_to", "beyond", "step")]

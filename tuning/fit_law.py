@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tuning.family import candidate_terms
 from tuning.law import Law
-from tuning.subsets import Problem, Scored, select_subset
+from tuning.overlap import SIZE as OVERLAP_SIZE
+from tuning.overlap import best_overlap
+from tuning.robust_fit import MOST_COSTS, Problems, solve
+from tuning.subsets import Problem, Scored, Selection, select_subset
 from tuning.terms import CONSTANT, Term
 from tuning.time_model import LeftOut, PlausibleLaw, TimeModel
 
 MOST_TERMS = 4
 _MOST_PLAUSIBLE = 8
+_MOST_WORSE = 4.0  # nats: what is less likely than that is no longer plausible
+_STARTS = 16
+_HUBER = 1.5
 _NOISE_FLOOR = 0.005
 """Relative: clocks and rounding leave no time better known than this."""
 
@@ -41,47 +48,119 @@ def fit_law(
         np.array([term.size if term.factors else 0 for term in every]),
         np.array([term.surprise for term in every]),
     )
-    selection = select_subset(problem, MOST_TERMS)
-    chosen = selection.chosen
-    near = [one for one in selection.scored if one.size <= chosen.size and one.support != chosen.support]
-    near = [one for one in near if problem.merit(one) < problem.merit(chosen) + 4]
-    plausible = [chosen, *sorted(near, key=problem.merit)[: _MOST_PLAUSIBLE - 1]]
-    merits = np.array([problem.merit(one) for one in plausible])
-    weights = np.exp(-(merits - merits.min()))
-    laws = tuple(
-        _with_error_bars(problem, every, one, float(weight))
-        for one, weight in zip(plausible, weights / weights.sum(), strict=True)
-    )
-    errors = dict(zip((one.size for one in selection.path), selection.errors, strict=True))
-    larger = [one for one in selection.scored if set(one.support) > set(chosen.support)]
-    left_out = {
-        every[next(iter(set(one.support) - set(chosen.support)))].name: one.error
-        for one in sorted(larger, key=lambda one: -one.error)
-        if len(one.support) == len(chosen.support) + 1
-    }
-    used = laws[0].law.columns
+    n_rows = len(times_ms)
+    selection = select_subset(problem, min(MOST_TERMS, max(n_rows - 3, 0)))
+    delta = _HUBER * max(1.4826 * float(np.median(np.abs(selection.chosen.left_out))), _NOISE_FLOOR)
+    found = [
+        _Found(_law(every, one), one.size, error, spread, problem.merit(one))
+        for one, error, spread in zip(selection.path, selection.errors, selection.standard_errors, strict=True)
+    ]
+    overlap = best_overlap(problem, every, delta)
+    if overlap is not None:
+        found.append(_Found(overlap.law, OVERLAP_SIZE, overlap.error, overlap.standard_error, overlap.merit))
+    best = min(found, key=lambda one: one.error)
+    chosen = min((one for one in found if one.error <= best.error + best.spread), key=lambda one: (one.size, one.error))
+    alike = [_Found(_law(every, one), one.size, one.error, 0.0, problem.merit(one)) for one in selection.scored]
+    alike = [one for one in alike if one.size <= chosen.size and one.law.terms != chosen.law.terms]
+    alike = sorted((one for one in alike if one.merit < chosen.merit + _MOST_WORSE), key=lambda one: one.merit)
+    plausible = [chosen, *alike[: _MOST_PLAUSIBLE - 1]]
+    weights = np.exp(-(np.array([one.merit for one in plausible]) - min(one.merit for one in plausible)))
+    laws = _with_error_bars(problem, columns, [one.law for one in plausible], weights / weights.sum(), delta)
+    constant = next((one.error for one in found if one.size == 0), math.inf)
     return TimeModel(
         laws=laws,
-        n_rows=len(times_ms),
-        error=errors.get(chosen.size, math.inf) if len(times_ms) > 1 else math.inf,
-        constant_error=errors.get(0, math.inf) if len(times_ms) > 1 else math.inf,
-        hull={name: np.asarray(columns[name], float) for name in used},
-        left_out=tuple(LeftOut(term, error) for term, error in reversed(left_out.items())),
+        n_rows=n_rows,
+        error=chosen.error if n_rows > 1 else math.inf,
+        constant_error=constant if n_rows > 1 else math.inf,
+        hull={name: np.asarray(columns[name], float) for name in laws[0].law.columns},
+        left_out=_left_out(every, selection, chosen.law),
         messages=tuple(messages),
     )
 
 
-def _with_error_bars(problem: Problem, every: Sequence[Term], one: Scored, weight: float) -> PlausibleLaw:
-    terms = tuple(every[k] for k in one.support)
-    law = Law(terms, tuple(map(float, one.costs)), (0,) * len(terms))
-    design = problem.columns[:, list(one.support)]
-    predicted = design @ one.costs
-    slopes = design * one.costs / predicted[:, None]
-    residual = np.log(problem.times_ms / predicted)
-    degrees = max(len(residual) - len(terms), 1)
-    spread = max(math.sqrt(float(np.sum(problem.weights * residual**2)) / degrees), _NOISE_FLOOR)
-    covariance = np.linalg.pinv(slopes.T @ (problem.weights[:, None] * slopes), hermitian=True) * spread**2
-    return PlausibleLaw(law, weight, covariance, spread)
+@dataclass(frozen=True)
+class _Found:
+    """A law of some size, and what rows say that it, or rather its selection, had not seen."""
+
+    law: Law
+    size: int
+    error: float
+    spread: float
+    merit: float
+
+
+def _law(every: Sequence[Term], one: Scored) -> Law:
+    return Law(tuple(every[k] for k in one.support), tuple(map(float, one.costs)), (0,) * len(one.support))
+
+
+def _left_out(every: Sequence[Term], selection: Selection, law: Law) -> tuple[LeftOut, ...]:
+    """Each term that was tried with the chosen ones, and the error with it, best first."""
+    taken = set(law.terms) - {CONSTANT}
+    errors: dict[str, float] = {}
+    for one in selection.scored:
+        terms = {every[k] for k in one.support} - {CONSTANT}
+        if len(terms) == len(taken) + 1 and terms > taken:
+            errors.setdefault(next(iter(terms - taken)).name, one.error)
+    return tuple(LeftOut(term, error) for term, error in sorted(errors.items(), key=lambda item: item[1]))
+
+
+def _with_error_bars(
+    problem: Problem, columns: Mapping[str, np.ndarray], laws: Sequence[Law], weights: np.ndarray, delta: float
+) -> tuple[PlausibleLaw, ...]:
+    """All laws fitted again from many starts, with the covariance of their costs from the Jacobian."""
+    refitted = refit(problem.times_ms, problem.weights, columns, laws, delta)
+    found = []
+    for law, weight in zip(refitted, weights, strict=True):
+        slopes = law.slopes(columns)
+        residual = np.log(problem.times_ms / law.predict(columns))
+        softened = problem.weights / np.sqrt(1 + (residual / delta) ** 2)
+        degrees = max(len(residual) - len(law.terms), 1)
+        spread = max(math.sqrt(float(np.sum(softened * residual**2)) / degrees), _NOISE_FLOOR)
+        covariance = np.linalg.pinv(slopes.T @ (softened[:, None] * slopes), hermitian=True) * spread**2
+        found.append(PlausibleLaw(law, float(weight), covariance, spread))
+    return tuple(found)
+
+
+def refit(
+    times_ms: np.ndarray,
+    weights: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+    laws: Sequence[Law],
+    delta: float,
+    seed: int = 0,
+) -> list[Law]:
+    """The same laws at the optimum of the robust loss, from their costs and from starts scattered about them."""
+    rng = np.random.default_rng(seed)
+    n_rows = len(times_ms)
+    lanes = len(laws) * _STARTS
+    designs = np.zeros((lanes, n_rows, MOST_COSTS))
+    sides = np.full((lanes, MOST_COSTS), -1)
+    starts = np.zeros((lanes, MOST_COSTS))
+    scales = []
+    for k, law in enumerate(laws):
+        own, n = slice(k * _STARTS, (k + 1) * _STARTS), len(law.terms)
+        design = law.design(columns)
+        scales.append((design / times_ms[:, None]).max(axis=0))
+        designs[own, :, :n] = design / scales[-1]
+        sides[own, :n] = law.sides
+        starts[own, :n] = np.log(np.array(law.costs_ms) * scales[-1])
+        starts[own, :n][1:] += rng.normal(0, 1, (_STARTS - 1, n))
+    log_costs, losses = solve(
+        Problems(
+            designs,
+            sides,
+            np.broadcast_to(np.log(times_ms), (lanes, n_rows)),
+            np.broadcast_to(weights, (lanes, n_rows)),
+            starts,
+            delta,
+        )
+    )
+    refitted = []
+    for k, (law, scale) in enumerate(zip(laws, scales, strict=True)):
+        best = k * _STARTS + int(losses[k * _STARTS : (k + 1) * _STARTS].argmin())
+        costs = np.exp(log_costs[best, : len(law.terms)]) / scale
+        refitted.append(replace(law, costs_ms=tuple(map(float, costs))))
+    return refitted
 
 
 def _merged(

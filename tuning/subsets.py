@@ -7,7 +7,7 @@ most six unknowns are one batched call, and leaving a row out is a formula and n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,21 +25,14 @@ class Scored:
     """A set of terms, its costs, and how far off it is for each row it was not fitted to.
 
     - `support`: indices of the terms, 0 is the constant; sorted.
-    - `left_out`: float64 `[rows]`, log of measured over predicted.
+    - `left_out`: float64 `[rows]`, log of measured over predicted; `error` is its mean size.
     """
 
     support: tuple[int, ...]
     costs: np.ndarray
     left_out: np.ndarray
     size: int
-
-    @property
-    def error(self) -> float:
-        return float(np.mean(np.abs(self.left_out)))
-
-    @property
-    def standard_error(self) -> float:
-        return float(np.std(np.abs(self.left_out), ddof=1) / np.sqrt(len(self.left_out)))
+    error: float
 
 
 @dataclass(frozen=True)
@@ -61,6 +54,12 @@ class Problem:
 
     def rows(self, keep: np.ndarray) -> Problem:
         return Problem(self.columns[keep], self.times_ms[keep], self.weights[keep], self.sizes, self.surprise)
+
+    def folds(self, n: int) -> np.ndarray:
+        """Which of `n` folds a row is in: neighbours in time in different ones, so that each sees the whole range."""
+        fold = np.empty(len(self.times_ms), int)
+        fold[np.argsort(self.times_ms, kind="stable")] = np.arange(len(fold)) % n
+        return fold
 
     def merit(self, one: Scored) -> float:
         """Smaller is better: what the left-out rows say, and what was known beforehand."""
@@ -96,7 +95,7 @@ def score_subsets(problem: Problem, most_terms: int, most_scored: int = _SCORED)
             beam = ranked[:_BEAM]
             by_support |= {one.support: one for one in _scored(scaled, times_ms, weights, ranked, sizes)}
         scored = sorted(by_support.values(), key=problem.merit)
-    unscaled = [Scored(one.support, one.costs / scale[list(one.support)], one.left_out, one.size) for one in scored]
+    unscaled = [replace(one, costs=one.costs / scale[list(one.support)]) for one in scored]
     return sorted(unscaled, key=lambda one: (one.size, problem.merit(one)))
 
 
@@ -123,11 +122,9 @@ def select_subset(problem: Problem, most_terms: int) -> Selection:
     """
     scored = score_subsets(problem, most_terms)
     path = _best_of_each_size(scored, most_terms)
-    n_rows, n_terms = problem.columns.shape
-    n_folds = min(n_rows, 10 if n_terms <= _FEW_TERMS or n_rows <= 12 else 5)
-    # Neighbours in time go to different folds, so that every fold sees the whole range.
-    fold = np.empty(n_rows, int)
-    fold[np.argsort(problem.times_ms, kind="stable")] = np.arange(n_rows) % n_folds
+    n_rows = len(problem.times_ms)
+    n_folds = n_folds_of(problem)
+    fold = problem.folds(n_folds)
     out = np.full((most_terms + 1, n_rows), np.nan)
     for k in range(n_folds):
         held = fold == k
@@ -149,6 +146,12 @@ def select_subset(problem: Problem, most_terms: int) -> Selection:
     )
 
 
+def n_folds_of(problem: Problem) -> int:
+    """Each row by itself where there are few; many candidates take too long for more than five folds."""
+    n_rows, n_terms = problem.columns.shape
+    return n_rows if n_rows <= 12 else 10 if n_terms <= _FEW_TERMS else 5
+
+
 def _best_of_each_size(scored: list[Scored], most: int) -> list[Scored]:
     best: dict[int, Scored] = {}
     for one in scored:
@@ -158,13 +161,10 @@ def _best_of_each_size(scored: list[Scored], most: int) -> list[Scored]:
 
 
 def _grown(beam: np.ndarray, n_terms: int) -> np.ndarray:
-    sets = {
-        tuple(sorted((*support, term)))
-        for support in map(tuple, beam)
-        for term in range(1, n_terms)
-        if term not in support
-    }
-    return np.array(sorted(sets), int).reshape(len(sets), beam.shape[1] + 1)
+    term = np.arange(1, n_terms)
+    sets = np.column_stack([np.repeat(beam, len(term), axis=0), np.tile(term, len(beam))])
+    sets = sets[~(sets[:, :-1] == sets[:, -1:]).any(axis=1)]
+    return np.unique(np.sort(sets, axis=1), axis=0)
 
 
 def _ranked(problem: Problem, columns: np.ndarray, weights: np.ndarray, supports: np.ndarray) -> np.ndarray:
@@ -215,17 +215,18 @@ def _scored(
         costs, left_out, sound = _fitted(columns, times_ms, weights, chosen)
         if keep_constant:
             with_constant = ~(sound & (costs[:, 0] < 0))
-        for support, cost, out, ok in zip(chosen, costs, left_out, sound & (costs > 0).all(axis=1), strict=True):
-            if ok:
-                size = int(sizes[support[support > 0]].sum())
-                found[tuple(support)] = Scored(tuple(map(int, support)), cost, out, size)
+        errors = np.abs(left_out).mean(axis=1)
+        size = np.where(chosen > 0, sizes[chosen], 0).sum(axis=1)
+        for k in np.flatnonzero(sound & (costs > 0).all(axis=1)):
+            support = tuple(chosen[k].tolist())
+            found[support] = Scored(support, costs[k], left_out[k], int(size[k]), float(errors[k]))
     return sorted(found.values(), key=lambda one: one.error)
 
 
 def _fitted(
     columns: np.ndarray, times_ms: np.ndarray, weights: np.ndarray, supports: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Robust Gauss-Newton on log times: costs `[sets, k]`, left-out residuals `[sets, rows]`, which are sound `[sets]`."""
+    """Robust Gauss-Newton on log times: costs `[sets, k]`, left-out residuals `[sets, rows]`, sound ones `[sets]`."""
     design = columns.T[supports].transpose(0, 2, 1)  # [sets, rows, k]
     relative = design / times_ms[:, None]
     row_weights = np.broadcast_to(weights, (len(supports), len(times_ms)))
@@ -243,8 +244,11 @@ def _fitted(
     residual = np.log(times_ms / predicted)
     slope = design / predicted[:, :, None]
     weighted = slope * row_weights[:, :, None]
-    inverse = np.linalg.pinv(np.einsum("snk,snl->skl", slope, weighted), hermitian=True)
-    leverage = np.einsum("snk,skl,snl->sn", weighted, inverse, slope)
+    matrix = np.einsum("snk,snl->skl", slope, weighted)
+    unit = np.broadcast_to(np.eye(matrix.shape[1]), matrix.shape)
+    matrix = np.where(sound[:, None, None], matrix, unit)
+    inverse = np.linalg.inv(matrix + 1e-12 * np.einsum("skk->s", matrix)[:, None, None] * unit)
+    leverage = ((weighted @ inverse) * slope).sum(axis=2)
     return costs, residual / np.maximum(1 - leverage, 1e-3), sound
 
 

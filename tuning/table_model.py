@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from tuning.timing_table import TimingTable
 from vtfs.input_error import InputError
 
 SCHEMA = 1
+FRAME = "frame"
+UNLISTED = "unlisted"
+_LEAST_REST = 1e-4  # of the frame: rounding may leave nothing of it, and nothing cannot be fitted
 
 __all__ = ["Prediction", "TableModel", "fit_table"]
 
@@ -22,10 +26,14 @@ class TableModel:
     """One model for each combination of labels.
 
     - `label_names`: in the order of the keys of `models`; none where the table has no labels.
+    - `sums`: frames whose time is predicted as the sum of these stages, each by its own model: their parts were timed
+      too, and what the parts leave of the frame (the stage `unlisted`) is nowhere negative. Stages grow by laws of
+      their own, so their sum holds further out than one law for everything.
     """
 
     label_names: tuple[str, ...]
     models: dict[tuple[str, ...], TimeModel]
+    sums: dict[tuple[str, ...], tuple[tuple[str, ...], ...]] = field(default_factory=dict)
 
     def predict(
         self, table_columns: Mapping[str, np.ndarray], labels: Mapping[str, tuple[str, ...]]
@@ -39,11 +47,8 @@ class TableModel:
         n_rows = _n_rows(table_columns, labels)
         predictions: dict[int, Prediction] = {}
         for key, rows in _rows_by_label(self.label_names, labels, n_rows).items():
-            model = self._model(key)
-            columns = {name: _numbers(table_columns, name)[rows] for name in model.columns}
-            # A constant needs no column, but as many predictions as there are rows.
-            columns = columns or {"": np.zeros(len(rows))}
-            predictions |= zip(rows.tolist(), model.predict(columns), strict=True)
+            parts = [self._predict_one(part, table_columns, rows) for part in self.sums.get(key, (key,))]
+            predictions |= zip(rows.tolist(), map(_added, zip(*parts, strict=True)), strict=True)
         return tuple(predictions[row] for row in range(n_rows))
 
     def as_json(self) -> dict[str, object]:
@@ -54,6 +59,7 @@ class TableModel:
                 {"labels": dict(zip(self.label_names, key, strict=True))} | model.as_json()
                 for key, model in self.models.items()
             ],
+            "sums": [{"of": list(key), "stages": [list(part) for part in parts]} for key, parts in self.sums.items()],
         }
 
     @classmethod
@@ -67,13 +73,22 @@ class TableModel:
                 tuple(str(one["labels"][name]) for name in names): TimeModel.from_json(one)
                 for one in entry["models"]  # type: ignore[union-attr]
             }
+            sums = {tuple(one["of"]): tuple(map(tuple, one["stages"])) for one in entry["sums"]}  # type: ignore[union-attr]
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(
                 f"model: a field is missing or wrong ({error!r}); write it again with `vtfs fit`."
             ) from None
         if not models:
             raise InputError("model: it is empty; write it again with `vtfs fit`.")
-        return cls(names, models)
+        return cls(names, models, sums)
+
+    def _predict_one(
+        self, key: tuple[str, ...], columns: Mapping[str, np.ndarray], rows: np.ndarray
+    ) -> tuple[Prediction, ...]:
+        model = self._model(key)
+        own = {name: _numbers(columns, name)[rows] for name in model.columns}
+        # A constant needs no column, but as many predictions as there are rows.
+        return model.predict(own or {"": np.zeros(len(rows))})
 
     def _model(self, key: tuple[str, ...]) -> TimeModel:
         if key in self.models:
@@ -94,12 +109,66 @@ def fit_table(table: TimingTable, seed: int = 0) -> TableModel:
     _check_times(table)
     columns = {name: _numbers(table.columns, name) for name in table.columns}
     label_names = tuple(table.labels)
-    models: dict[tuple[str, ...], TimeModel] = {}
-    for key, rows in _rows_by_label(label_names, table.labels, len(table)).items():
-        stage = dict(zip(label_names, key, strict=True)).get("stage")
-        own = {name: column[rows] for name, column in columns.items()}
-        models[key] = fit_law(own, [table.repeats_ms[row] for row in rows], stage, seed)
-    return TableModel(label_names, models)
+    by_label = {
+        key: ({name: column[rows] for name, column in columns.items()}, [table.repeats_ms[row] for row in rows])
+        for key, rows in _rows_by_label(label_names, table.labels, len(table)).items()
+    }
+    sums: dict[tuple[str, ...], tuple[tuple[str, ...], ...]] = {}
+    if "stage" in label_names:
+        at = label_names.index("stage")
+        for key in [key for key in by_label if key[at] == FRAME]:
+            parts = [other for other in by_label if other != key and _but(other, at) == _but(key, at)]
+            rest = _unlisted(by_label[key], [by_label[part] for part in parts])
+            if rest is not None:
+                unlisted = (*key[:at], UNLISTED, *key[at + 1 :])
+                by_label[unlisted] = rest
+                sums[key] = (*parts, unlisted)
+    models = {
+        key: fit_law(own, repeats_ms, key[label_names.index("stage")] if "stage" in label_names else None, seed)
+        for key, (own, repeats_ms) in by_label.items()
+    }
+    return TableModel(label_names, models, sums)
+
+
+_Rows = tuple[dict[str, np.ndarray], list[tuple[float, ...]]]
+
+
+def _but(key: tuple[str, ...], at: int) -> tuple[str, ...]:
+    return key[:at] + key[at + 1 :]
+
+
+def _unlisted(frame: _Rows, stages: list[_Rows]) -> _Rows | None:
+    """What the stages leave of the frame's time, row by row; `None` where a stage lacks a row, or they overlap."""
+    if not stages:
+        return None
+    rest = _medians(*frame)
+    whole = dict(rest)
+    for stage in stages:
+        times_ms = _medians(*stage)
+        for row in rest:
+            if row not in times_ms:
+                return None
+            rest[row] -= times_ms[row]
+    if any(rest[row] < _LEAST_REST * whole[row] for row in rest):
+        return None
+    keys = np.array(list(rest)).reshape(len(rest), len(frame[0]))
+    columns = {name: keys[:, k] for k, name in enumerate(frame[0])}
+    return columns, [(time_ms,) for time_ms in rest.values()]
+
+
+def _medians(columns: dict[str, np.ndarray], repeats_ms: list[tuple[float, ...]]) -> dict[tuple[float, ...], float]:
+    rows = zip(*columns.values(), strict=True) if columns else [()] * len(repeats_ms)
+    return {tuple(map(float, row)): float(np.median(own)) for row, own in zip(rows, repeats_ms, strict=True)}
+
+
+def _added(parts: tuple[Prediction, ...]) -> Prediction:
+    """Errors of stages are taken for independent: the half widths of their intervals add up in squares."""
+    if len(parts) == 1:
+        return parts[0]
+    time_ms = sum(part.time_ms for part in parts)
+    below = math.hypot(*(part.time_ms - part.low_ms for part in parts))
+    above = math.hypot(*(part.high_ms - part.time_ms for part in parts))
+    return Prediction(time_ms, max(time_ms - below, 0.0), time_ms + above, any(part.extrapolated for part in parts))
 
 
 def _check_times(table: TimingTable) -> None:
