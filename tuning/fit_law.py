@@ -20,8 +20,10 @@ from tuning.time_model import LeftOut, PlausibleLaw, TimeModel
 MOST_TERMS = 4
 _MOST_PLAUSIBLE = 8
 _MOST_WORSE = 4.0  # nats: what is less likely than that is no longer plausible
-_STARTS = 16
+_STARTS = 8
+_FEWEST_ROWS = 4
 _HUBER = 1.5
+_CHI2_90 = 2.71
 _NOISE_FLOOR = 0.005
 """Relative: clocks and rounding leave no time better known than this."""
 
@@ -40,16 +42,19 @@ def fit_law(
     columns, repeats_ms = _merged(columns, repeats_ms)
     times_ms = np.array([float(np.median(repeats)) for repeats in repeats_ms])
     terms, messages = candidate_terms(columns, stage)
+    columns = columns or {"": np.zeros(len(times_ms))}  # a constant needs no column, but as many times as rows
     every = [CONSTANT, *terms]
     problem = Problem(
-        np.stack([term.values(columns) for term in every], axis=1) if columns else np.ones((len(times_ms), 1)),
+        np.stack([term.values(columns) for term in every], axis=1),
         times_ms,
         _weights(repeats_ms),
         np.array([term.size if term.factors else 0 for term in every]),
         np.array([term.surprise for term in every]),
     )
     n_rows = len(times_ms)
-    selection = select_subset(problem, min(MOST_TERMS, max(n_rows - 3, 0)))
+    if terms and n_rows < _FEWEST_ROWS:
+        messages.append(f"{n_rows} rows: too few to tell how wrong the law is; measure at least {_FEWEST_ROWS}.")
+    selection = select_subset(problem, min(MOST_TERMS, max(n_rows - 3, int(n_rows == 3))))
     delta = _HUBER * max(1.4826 * float(np.median(np.abs(selection.chosen.left_out))), _NOISE_FLOOR)
     found = [
         _Found(_law(every, one), one.size, error, spread, problem.merit(one))
@@ -60,6 +65,10 @@ def fit_law(
         found.append(_Found(overlap.law, OVERLAP_SIZE, overlap.error, overlap.standard_error, overlap.merit))
     best = min(found, key=lambda one: one.error)
     chosen = min((one for one in found if one.error <= best.error + best.spread), key=lambda one: (one.size, one.error))
+    law, dropped = _identified(problem, columns, chosen.law, delta)
+    if dropped:
+        messages += dropped
+        chosen = replace(chosen, law=law)
     alike = [_Found(_law(every, one), one.size, one.error, 0.0, problem.merit(one)) for one in selection.scored]
     alike = [one for one in alike if one.size <= chosen.size and one.law.terms != chosen.law.terms]
     alike = sorted((one for one in alike if one.merit < chosen.merit + _MOST_WORSE), key=lambda one: one.merit)
@@ -73,6 +82,11 @@ def fit_law(
         error=chosen.error if n_rows > 1 else math.inf,
         constant_error=constant if n_rows > 1 else math.inf,
         hull={name: np.asarray(columns[name], float) for name in laws[0].law.columns},
+        ranges={
+            name: (float(column.min()), float(column.max()))
+            for name, column in columns.items()
+            if name and name not in laws[0].law.columns
+        },
         left_out=_left_out(every, selection, chosen.law),
         messages=tuple(messages),
     )
@@ -93,6 +107,33 @@ def _law(every: Sequence[Term], one: Scored) -> Law:
     return Law(tuple(every[k] for k in one.support), tuple(map(float, one.costs)), (0,) * len(one.support))
 
 
+def _identified(problem: Problem, columns: Mapping[str, np.ndarray], law: Law, delta: float) -> tuple[Law, list[str]]:
+    """Without the terms whose profile likelihood at a cost of zero is within the 90 % region, and messages.
+
+    Terms that grow together on these rows can stand in for each other: neither is then needed beside the other.
+    """
+    messages: list[str] = []
+    while sum(bool(term.factors) for term in law.terms) > 1 and not any(law.sides):
+        without = [_without(law, k) for k, term in enumerate(law.terms) if term.factors]
+        refitted, losses = refit(problem.times_ms, problem.weights, columns, [law, *without], delta)
+        degrees = max(len(problem.times_ms) - len(law.terms), 1)
+        # Log of the likelihood ratio, the noise profiled out as well.
+        ratio = degrees * np.log(np.maximum(losses[1:], 1e-12) / max(losses[0], 1e-12))
+        weakest = int(ratio.argmin())
+        if ratio[weakest] >= _CHI2_90:
+            break
+        gone = next(term.name for term in law.terms if term not in without[weakest].terms)
+        law = refitted[1 + weakest]
+        messages.append(f"`{gone}` cannot be told from the other terms on these rows: dropped.")
+    return law, messages
+
+
+def _without(law: Law, k: int) -> Law:
+    return Law(
+        law.terms[:k] + law.terms[k + 1 :], law.costs_ms[:k] + law.costs_ms[k + 1 :], law.sides[:k] + law.sides[k + 1 :]
+    )
+
+
 def _left_out(every: Sequence[Term], selection: Selection, law: Law) -> tuple[LeftOut, ...]:
     """Each term that was tried with the chosen ones, and the error with it, best first."""
     taken = set(law.terms) - {CONSTANT}
@@ -108,7 +149,7 @@ def _with_error_bars(
     problem: Problem, columns: Mapping[str, np.ndarray], laws: Sequence[Law], weights: np.ndarray, delta: float
 ) -> tuple[PlausibleLaw, ...]:
     """All laws fitted again from many starts, with the covariance of their costs from the Jacobian."""
-    refitted = refit(problem.times_ms, problem.weights, columns, laws, delta)
+    refitted, _ = refit(problem.times_ms, problem.weights, columns, laws, delta)
     found = []
     for law, weight in zip(refitted, weights, strict=True):
         slopes = law.slopes(columns)
@@ -128,8 +169,8 @@ def refit(
     laws: Sequence[Law],
     delta: float,
     seed: int = 0,
-) -> list[Law]:
-    """The same laws at the optimum of the robust loss, from their costs and from starts scattered about them."""
+) -> tuple[list[Law], np.ndarray]:
+    """The same laws at the optimum of the robust loss, and that loss: from their costs, and starts about them."""
     rng = np.random.default_rng(seed)
     n_rows = len(times_ms)
     lanes = len(laws) * _STARTS
@@ -155,12 +196,13 @@ def refit(
             delta,
         )
     )
-    refitted = []
+    refitted, lowest = [], np.empty(len(laws))
     for k, (law, scale) in enumerate(zip(laws, scales, strict=True)):
         best = k * _STARTS + int(losses[k * _STARTS : (k + 1) * _STARTS].argmin())
         costs = np.exp(log_costs[best, : len(law.terms)]) / scale
         refitted.append(replace(law, costs_ms=tuple(map(float, costs))))
-    return refitted
+        lowest[k] = losses[best]
+    return refitted, lowest
 
 
 def _merged(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,23 @@ class Law:
         **Raises:** `InputError` where a column is missing.
         """
         return combined(self.design(columns), np.array(self.costs_ms), np.array(self.sides))
+
+    def predict_one(self, point: Mapping[str, Any]) -> Any:
+        """The same for one row of JAX scalars, to be differentiated; milliseconds."""
+        import jax.numpy as jnp
+
+        totals = [
+            sum(
+                cost * term.values(point, jnp)
+                for term, cost, of in zip(self.terms, self.costs_ms, self.sides, strict=True)
+                if of == side
+            )
+            for side in sorted(set(self.sides))
+        ]
+        larger = jnp.maximum(totals[0], totals[-1])
+        if len(totals) == 1:
+            return larger
+        return larger * (1 + (jnp.minimum(*totals) / larger) ** SHARPNESS) ** (1 / SHARPNESS)
 
     def design(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """float64 `[rows, terms]`."""
@@ -87,9 +105,8 @@ class Law:
 
 
 def combined(design: np.ndarray, costs_ms: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Times `[rows]` of a design `[rows, terms]`."""
-    parts = design * costs_ms
-    first, second = parts[:, sides == 0].sum(axis=1), parts[:, sides == 1].sum(axis=1)
+    """Times `[..., rows]` of a design `[rows, terms]` and costs `[..., terms]`."""
+    first, second = ((costs_ms * (sides == side)) @ design.T for side in (0, 1))
     larger, smaller = np.maximum(first, second), np.minimum(first, second)
     ratio = smaller / np.maximum(larger, 1e-300)
     return larger * (1 + ratio**SHARPNESS) ** (1 / SHARPNESS)

@@ -18,7 +18,7 @@ from tuning.law import SHARPNESS
 MOST_COSTS = 6
 _MAX_STEPS = 32  # a cost that goes to zero would go on for ever, in its log; nothing else needs as many
 _LEAST_LOG = -60.0
-_LANES = 256
+_LANES = 128
 _ROWS = (32, 256)  # then every power of four
 
 

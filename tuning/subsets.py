@@ -16,7 +16,7 @@ _SCORED_IN_A_FOLD = 30
 _BEAM = 30  # sets of a size that are grown
 _FEW_TERMS = 60
 _MOST_PAIRS = 120_000
-_ROUNDS = 8
+_ROUNDS = 5
 _HUBER = 1.5  # residuals beyond this many standard deviations count by their size, not their square
 
 
@@ -83,7 +83,7 @@ def score_subsets(problem: Problem, most_terms: int, most_scored: int = _SCORED)
             outlying = np.ones(n_rows)
         by_support = {found.support: found for found in scored}
         beam = np.zeros((1, 1), int)
-        for level in range(1, min(most_terms, n_rows - 2, n_terms - 1) + 1):
+        for level in range(1, min(most_terms, max(n_rows - 2, 1), n_rows - 1, n_terms - 1) + 1):
             if level == 2 and (n_terms - 1) * (n_terms - 2) // 2 <= _MOST_PAIRS:
                 one, other = np.triu_indices(n_terms - 1, 1)
                 grown = np.column_stack([np.zeros_like(one), one + 1, other + 1])
@@ -123,6 +123,8 @@ def select_subset(problem: Problem, most_terms: int) -> Selection:
     scored = score_subsets(problem, most_terms)
     path = _best_of_each_size(scored, most_terms)
     n_rows = len(problem.times_ms)
+    if n_rows == 1:
+        return Selection(path[0], tuple(path), (np.inf,), (np.inf,), tuple(scored))
     n_folds = n_folds_of(problem)
     fold = problem.folds(n_folds)
     out = np.full((most_terms + 1, n_rows), np.nan)
@@ -239,7 +241,7 @@ def _fitted(
         slope = design / predicted[:, :, None]
         step = np.clip(residual, -1.0, 1.0)  # a start far off must not overshoot
         costs = _weighted(slope, step + np.einsum("snk,sk->sn", slope, costs), row_weights)
-    sound = np.isfinite(costs).all(axis=1)
+    sound = np.asarray(np.isfinite(costs).all(axis=1))
     predicted = np.maximum(np.einsum("snk,sk->sn", design, np.nan_to_num(costs)), floor_ms)
     residual = np.log(times_ms / predicted)
     slope = design / predicted[:, :, None]

@@ -82,11 +82,16 @@ class TableModel:
             raise InputError("model: it is empty; write it again with `vtfs fit`.")
         return cls(names, models, sums)
 
+    def parts(self, key: tuple[str, ...]) -> tuple[TimeModel, ...]:
+        """The models whose times add up to that of these labels: one, but for the sums."""
+        return tuple(self._model(part) for part in self.sums.get(key, (key,)))
+
     def _predict_one(
         self, key: tuple[str, ...], columns: Mapping[str, np.ndarray], rows: np.ndarray
     ) -> tuple[Prediction, ...]:
         model = self._model(key)
-        own = {name: _numbers(columns, name)[rows] for name in model.columns}
+        used = [*model.columns, *(name for name in model.ranges if name in columns)]
+        own = {name: _numbers(columns, name)[rows] for name in used}
         # A constant needs no column, but as many predictions as there are rows.
         return model.predict(own or {"": np.zeros(len(rows))})
 

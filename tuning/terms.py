@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from types import ModuleType
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,9 +22,9 @@ class Factor:
     power: float = 1.0
     log_power: int = 0
 
-    def values(self, x: np.ndarray) -> np.ndarray:
-        grown = x**self.power if self.power else np.ones_like(x)
-        return grown * np.log2(np.maximum(x, 1.0)) ** self.log_power if self.log_power else grown
+    def values(self, x: Any, xp: ModuleType = np) -> Any:
+        grown = x**self.power if self.power else xp.ones_like(x)
+        return grown * xp.log2(xp.maximum(x, 1.0)) ** self.log_power if self.log_power else grown
 
     @property
     def name(self) -> str:
@@ -47,26 +48,26 @@ class Term:
     shape: Shape = "whole"
     knot: float = 0.0
 
-    def values(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """float64 `[rows]`.
+    def values(self, columns: Mapping[str, Any], xp: ModuleType = np) -> Any:
+        """float64 `[rows]`; with `jax.numpy` for `xp` it can be differentiated.
 
         **Raises:** `InputError` where a column is missing.
         """
         if not self.factors:
-            return np.ones(len(next(iter(columns.values()), np.empty(0))))
+            return xp.ones_like(next(iter(columns.values())))
         missing = [factor.column for factor in self.factors if factor.column not in columns]
         if missing:
             raise InputError(f"column `{missing[0]}`: missing; the model depends on it, add it to the table.")
-        x = np.asarray(columns[self.factors[0].column], float)
+        x = xp.asarray(columns[self.factors[0].column], float)
         if self.shape == "up_to":
-            return np.minimum(x, self.knot)
+            return xp.minimum(x, self.knot)
         if self.shape == "beyond":
-            return np.maximum(x - self.knot, 0.0)
+            return xp.maximum(x - self.knot, 0.0)
         if self.shape == "step":
-            return (x > self.knot).astype(float)
-        product = np.ones_like(x)
+            return xp.where(x > self.knot, 1.0, 0.0)
+        product = xp.ones_like(x)
         for factor in self.factors:
-            product = product * factor.values(np.asarray(columns[factor.column], float))
+            product = product * factor.values(xp.asarray(columns[factor.column], float), xp)
         return product
 
     @property

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import nnls
-from scipy.special import stdtr
+from scipy.special import ndtri, stdtr, stdtrit
 
-from tuning.law import Law
+from tuning.law import Law, combined
 
 COVERAGE = 0.9
 _EXPONENT_SPREAD = 0.5
@@ -62,6 +62,7 @@ class TimeModel:
     - `error`, `constant_error`: mean size of log(measured / predicted) for rows that were left out of the whole fit,
       selection included; of the law and of a constant. Infinite where there was one row only.
     - `hull`: the columns that the law depends on, float64 `[points]` each: what it was fitted to.
+    - `ranges`: least and most of the other columns it was fitted to: beyond them they may matter after all.
     - `left_out`, `messages`: what was not taken, and what could not be told apart.
     """
 
@@ -70,6 +71,7 @@ class TimeModel:
     error: float
     constant_error: float
     hull: dict[str, np.ndarray]
+    ranges: dict[str, tuple[float, float]]
     left_out: tuple[LeftOut, ...]
     messages: tuple[str, ...]
 
@@ -103,30 +105,58 @@ class TimeModel:
             for t, low, high, far in zip(times_ms, low_ms, high_ms, beyond, strict=True)
         )[:n_rows]
 
+    def samples_ms(self, columns: Mapping[str, np.ndarray], n: int, seed: int) -> np.ndarray:
+        """Times as they may really be, `[n, rows]`: a plausible law with plausible costs for each sample, no noise.
+
+        Beyond the data also with an exponent that may be wrong, the same for all rows of a sample.
+        """
+        rng = np.random.default_rng(seed)
+        weights = np.array([one.weight for one in self.laws])
+        of_law = rng.choice(len(self.laws), size=n, p=weights / weights.sum())
+        exponent = rng.normal(0, _EXPONENT_SPREAD / self.degrees_of_freedom, n)
+        sampled = np.empty((n, len(next(iter(columns.values())))))
+        for k, one in enumerate(self.laws):
+            own = of_law == k
+            moved = rng.multivariate_normal(np.zeros(len(one.covariance)), one.covariance, own.sum(), method="eigh")
+            costs = np.array(one.law.costs_ms) * np.exp(moved)
+            sampled[own] = combined(one.law.design(columns), costs, np.array(one.law.sides))
+        return sampled * np.exp(exponent[:, None] * self.beyond(columns))
+
     def beyond(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """How far outside the hull of the fitted rows, as a log of the ratio of sizes, `[rows]`; 0 inside."""
-        if not self.hull:
-            return np.zeros(len(next(iter(columns.values()))))
-        points = np.stack([_stretched(self.hull[name], self.hull[name]) for name in self.hull], axis=1)
-        asked = np.stack([_stretched(np.asarray(columns[name], float), self.hull[name]) for name in self.hull], axis=1)
-        # A convex combination: non-negative weights that add up to 1, the last row made too stiff to bend.
-        stiff = 1e3 * (1 + np.abs(points).max())
-        corners = np.vstack([points.T, np.full(len(points), stiff)])
-        outside = np.empty(len(asked))
-        for row, point in enumerate(asked):
-            weights, _ = nnls(corners, np.append(point, stiff))
-            outside[row] = np.linalg.norm(points.T @ weights / max(weights.sum(), 1e-12) - point)
-        return np.where(outside > 1e-5, outside, 0.0)
+        """How far outside the fitted rows, as a log of the ratio of sizes, `[rows]`; 0 inside.
+
+        Inside the convex hull for what the law depends on, and within the range of every other column that is given.
+        """
+        squared = np.zeros(len(next(iter(columns.values()))))
+        for name, ends in self.ranges.items():
+            if name in columns:
+                least, most, x = (_stretched(np.asarray(v, float), np.array(ends)) for v in (*ends, columns[name]))
+                squared += np.maximum(np.maximum(x - most, least - x), 0) ** 2
+        if self.hull:
+            points = np.stack([_stretched(self.hull[name], self.hull[name]) for name in self.hull], axis=1)
+            asked = np.stack([_stretched(np.asarray(columns[n], float), self.hull[n]) for n in self.hull], axis=1)
+            # A convex combination: non-negative weights that add up to 1, the last row made too stiff to bend.
+            stiff = 1e3 * (1 + np.abs(points).max())
+            corners = np.vstack([points.T, np.full(len(points), stiff)])
+            for row, point in enumerate(asked):
+                if ((point >= points.min(axis=0)) & (point <= points.max(axis=0))).all() and len(self.hull) == 1:
+                    continue
+                weights, _ = nnls(corners, np.append(point, stiff))
+                squared[row] += np.sum((points.T @ weights / max(weights.sum(), 1e-12) - point) ** 2)
+        return np.where(squared > 1e-10, np.sqrt(squared), 0.0)
 
     def interval_ms(self, columns: Mapping[str, np.ndarray], beyond: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Ends of the 90 % interval, `[rows]` each: quantiles of the mixture of all plausible laws."""
         centres, widths = [], []
+        quantile = (1 + COVERAGE) / 2
+        normal = float(ndtri(quantile) / stdtrit(self.degrees_of_freedom, quantile))
         for one in self.laws:
             slopes = one.law.slopes(columns)
             of_costs = np.einsum("rk,kl,rl->r", slopes, one.covariance, slopes)
             of_exponent = (_EXPONENT_SPREAD / self.degrees_of_freedom * beyond) ** 2
             centres.append(np.log(np.maximum(one.law.predict(columns), 1e-300)))
-            widths.append(np.sqrt(one.spread**2 + np.maximum(of_costs, 0) + of_exponent))
+            # Few rows say little about the scatter, hence Student's t; the exponent's is no estimate, but normal.
+            widths.append(np.sqrt(one.spread**2 + np.maximum(of_costs, 0) + of_exponent * normal**2))
         weights = np.array([one.weight for one in self.laws])
         ends = _mixture_quantiles(np.array(centres), np.array(widths), weights, self.degrees_of_freedom)
         return np.exp(ends[0]), np.exp(ends[1])
@@ -141,6 +171,7 @@ class TimeModel:
             "error": _finite(self.error),
             "constant_error": _finite(self.constant_error),
             "hull": {name: column.tolist() for name, column in self.hull.items()},
+            "ranges": {name: list(ends) for name, ends in self.ranges.items()},
             "left_out": [{"term": one.term, "error": _finite(one.error)} for one in self.left_out],
             "messages": list(self.messages),
         }
@@ -159,6 +190,7 @@ class TimeModel:
             _or_infinite(entry["error"]),
             _or_infinite(entry["constant_error"]),
             {name: np.array(column, float) for name, column in entry["hull"].items()},  # type: ignore[union-attr]
+            {name: (float(low), float(high)) for name, (low, high) in entry["ranges"].items()},  # type: ignore[union-attr]
             tuple(LeftOut(one["term"], _or_infinite(one["error"])) for one in entry["left_out"]),  # type: ignore[union-attr]
             tuple(entry["messages"]),  # type: ignore[arg-type]
         )
