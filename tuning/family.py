@@ -18,6 +18,27 @@ LOG_POWERS = (0, 1)
 
 LIGHTS = frozenset({"lights", "num_lights", "n_lights", "light_count"})
 TILES = frozenset({"tile", "tile_px", "tile_px_x", "tile_size"})
+COUNTS = frozenset(
+    {
+        "samples",
+        "cells_total",
+        "clusters_occupied",
+        "light_cluster_pairs",
+        "lighting_computations",
+        "tree_tests",
+        "leaf_tests",
+        "tests",
+        "tree_nodes",
+        "test_and_set",
+        "extra_plane_tests",
+        "bytes_moved",
+        "shading_lanes",
+        "shading_steps",
+        "assign_steps",
+        "divergence",
+    }
+)
+"""Work that was counted, see `vtfs.op_counts`: linear."""
 STAGES = {"build_bvh": "build_tree", "assign_lights": "assign", "light_culling": "assign"}
 """Names that publications use for our stages."""
 
@@ -45,23 +66,25 @@ def candidate_terms(columns: Mapping[str, np.ndarray], stage: str | None = None)
             usable[name] = column
     terms: list[Term] = []
     for name, column in usable.items():
-        terms += _of_one(name, column, stage)
-    terms += _products(usable)
+        terms += [Term((factor,)) for factor in _factors(name, column, stage)]
+    terms += _products(usable, stage)
     for name, column in usable.items():
         terms += _cut(name, column)
     return _told_apart(terms, usable, messages), messages
 
 
-def _of_one(name: str, column: np.ndarray, stage: str | None) -> list[Term]:
+def _factors(name: str, column: np.ndarray, stage: str | None) -> tuple[Factor, ...]:
+    if name in COUNTS:
+        return (Factor(name),)  # a unit of work costs what it costs
     if name in LIGHTS:
         linear, n_log_n, log_n = Factor(name), Factor(name, 1.0, 1), Factor(name, 0.0, 1)
+        # Sorting by merges: N log N (van Oosten ch. 5); N / 31 nodes; N reductions and Morton codes.
         by_stage = {"sort": (n_log_n,), "build_tree": (linear,), "unlisted": (linear,)}
-        factors = by_stage.get(STAGES.get(stage or "", stage or ""), (linear, n_log_n, log_n))
-    elif name in TILES:
-        factors = tuple(Factor(name, power) for power in (1.0, -1.0, 2.0, -2.0))
-    else:
-        factors = _generic(name, column)
-    return [Term((factor,)) for factor in factors]
+        return by_stage.get(STAGES.get(stage or "", stage or ""), (linear, n_log_n, log_n))
+    if name in TILES:
+        powers = (1.0, -1.0, 2.0, -2.0) if column.min() > 0 else (1.0, 2.0)
+        return tuple(Factor(name, power) for power in powers)
+    return _generic(name, column)
 
 
 def _generic(name: str, column: np.ndarray) -> tuple[Factor, ...]:
@@ -71,10 +94,14 @@ def _generic(name: str, column: np.ndarray) -> tuple[Factor, ...]:
     )
 
 
-def _products(usable: Mapping[str, np.ndarray]) -> list[Term]:
-    pairs = list(itertools.combinations(usable, 2))
+def _products(usable: Mapping[str, np.ndarray], stage: str | None) -> list[Term]:
+    """Of two columns; counts of work are products already."""
+    pairs = list(itertools.combinations([name for name in usable if name not in COUNTS], 2))
     whole = [
-        Term((a, b)) for one, other in pairs for a in _generic(one, usable[one]) for b in _generic(other, usable[other])
+        Term((a, b))
+        for one, other in pairs
+        for a in _factors(one, usable[one], stage)
+        for b in _factors(other, usable[other], stage)
     ]
     return whole if len(whole) <= _MOST_PRODUCTS else [Term((Factor(a), Factor(b))) for a, b in pairs]
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from tuning.family import candidate_terms
 from tuning.law import Law
-from tuning.overlap import SIZE as OVERLAP_SIZE
-from tuning.overlap import best_overlap
+from tuning.overlap import best_overlaps
 from tuning.robust_fit import MOST_COSTS, Problems, solve
 from tuning.subsets import Problem, Scored, Selection, select_subset
 from tuning.terms import CONSTANT, Term
@@ -60,9 +59,10 @@ def fit_law(
         _Found(_law(every, one), one.size, error, spread, problem.merit(one))
         for one, error, spread in zip(selection.path, selection.errors, selection.standard_errors, strict=True)
     ]
-    overlap = best_overlap(problem, every, delta)
-    if overlap is not None:
-        found.append(_Found(overlap.law, OVERLAP_SIZE, overlap.error, overlap.standard_error, overlap.merit))
+    found += [
+        _Found(one.law, one.size, one.error, one.standard_error, one.merit)
+        for one in best_overlaps(problem, every, delta)
+    ]
     best = min(found, key=lambda one: one.error)
     chosen = min((one for one in found if one.error <= best.error + best.spread), key=lambda one: (one.size, one.error))
     law, dropped = _identified(problem, columns, chosen.law, delta)

@@ -1,0 +1,5 @@
+from collections.abc import Iterator
+
+
+def rows(*_) -> Iterator[tuple[str, str, str]]:
+    yield from ()
