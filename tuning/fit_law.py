@@ -59,10 +59,9 @@ def fit_law(
         _Found(_law(every, one), one.size, error, spread, problem.merit(one))
         for one, error, spread in zip(selection.path, selection.errors, selection.standard_errors, strict=True)
     ]
-    found += [
-        _Found(one.law, one.size, one.error, one.standard_error, one.merit)
-        for one in best_overlaps(problem, every, delta)
-    ]
+    # One term may be enough; what two resources make of a time takes at least two.
+    overlaps = best_overlaps(problem, every, delta) if selection.chosen.size > 1 else []
+    found += [_Found(one.law, one.size, one.error, one.standard_error, one.merit) for one in overlaps]
     best = min(found, key=lambda one: one.error)
     chosen = min((one for one in found if one.error <= best.error + best.spread), key=lambda one: (one.size, one.error))
     law, dropped = _identified(problem, columns, chosen.law, delta)

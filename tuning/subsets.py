@@ -121,7 +121,7 @@ def select_subset(problem: Problem, most_terms: int) -> Selection:
     The error of a size is cross-validated with the selection inside: Hastie, Tibshirani, Friedman 2009, 7.10.2.
     """
     scored = score_subsets(problem, most_terms)
-    path = _best_of_each_size(scored, most_terms)
+    path = _best_of_each_size(problem, scored, most_terms)
     n_rows = len(problem.times_ms)
     if n_rows == 1:
         return Selection(path[0], tuple(path), (np.inf,), (np.inf,), tuple(scored))
@@ -130,7 +130,8 @@ def select_subset(problem: Problem, most_terms: int) -> Selection:
     out = np.full((most_terms + 1, n_rows), np.nan)
     for k in range(n_folds):
         held = fold == k
-        within = _best_of_each_size(score_subsets(problem.rows(~held), most_terms, _SCORED_IN_A_FOLD), most_terms)
+        seen = problem.rows(~held)
+        within = _best_of_each_size(seen, score_subsets(seen, most_terms, _SCORED_IN_A_FOLD), most_terms)
         for one in within:
             predicted = problem.columns[held][:, list(one.support)] @ one.costs
             out[one.size, held] = np.abs(np.log(problem.times_ms[held] / np.maximum(predicted, 1e-300)))
@@ -154,12 +155,20 @@ def n_folds_of(problem: Problem) -> int:
     return n_rows if n_rows <= 12 else 10 if n_terms <= _FEW_TERMS else 5
 
 
-def _best_of_each_size(scored: list[Scored], most: int) -> list[Scored]:
+def _best_of_each_size(problem: Problem, scored: list[Scored], most: int) -> list[Scored]:
+    """Of the sets that are as good as the best, within one standard error of their difference, the plainest."""
     best: dict[int, Scored] = {}
-    for one in scored:
-        if one.size <= most:
-            best.setdefault(one.size, one)
-    return [best[size] for size in sorted(best)]
+    chosen: dict[int, Scored] = {}
+    for one in scored:  # best first within each size
+        if one.size > most:
+            continue
+        first = best.setdefault(one.size, one)
+        plainest = chosen.setdefault(one.size, one)
+        if problem.surprise[list(one.support)].sum() < problem.surprise[list(plainest.support)].sum():
+            worse = np.abs(one.left_out) - np.abs(first.left_out)
+            if worse.mean() <= worse.std(ddof=1) / np.sqrt(len(worse)):
+                chosen[one.size] = one
+    return [chosen[size] for size in sorted(chosen)]
 
 
 def _grown(beam: np.ndarray, n_terms: int) -> np.ndarray:

@@ -59,7 +59,7 @@ def _both_ways(pipeline: str, label: str, own: Sequence[Row], peers: Peers) -> I
     for name, both in regrets.items():
         every = np.concatenate(both)
         mean = np.mean([one.mean() for one in both])
-        figure = f"{mean:.1%} mean, {every.max():.0%} worst, {(every == 0).sum()} of {len(every)} exactly right"
+        figure = f"{mean:.2%} mean, {every.max():.0%} worst, {(every == 0).sum()} of {len(every)} exactly right"
         target = _TARGETS[pipeline] if name == "ours" and not label else ""
         yield (f"{pipeline}{label}: regret" if name == "ours" else f"  {name}"), figure, target
 
