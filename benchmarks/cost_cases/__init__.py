@@ -1,0 +1,1 @@
+"""What `benchmarks/cost_models.py` measures: each file makes rows of its table."""
