@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vtfs.cluster_grid import cluster_grid, n_cells
+from vtfs.cluster_grid import configured_grid, n_cells, n_keys
 from vtfs.clusters import Clusters
 from vtfs.gbuffer import GBuffer, from_runs, gbuffer_on_device, positions_on_device
 from vtfs.input_error import InputError
@@ -33,6 +33,7 @@ from vtfs.techniques import REGISTRY, Plan, Stage, walk_chunk
 from vtfs.view_samples import ViewSamples
 
 _BRUTE_FORCE_WORD = 32
+_NO_STRUCTURES = ("positions", "gbuffer", "normals", "grid", "light_cutoff")
 
 
 class CapacityError(InputError):
@@ -106,8 +107,11 @@ class FrameInputs:
             "light_cutoff": np.float32(params["light_cutoff"]),
         }
         if "tile_px" in params:
-            slices = 1 if REGISTRY[config.technique].one_slice else int(params["depth_slices"])
-            env["grid"] = cluster_grid(self.camera, int(params["tile_px"]), slices, self.deepest_m)
+            one_slice = REGISTRY[config.technique].one_slice
+            env["grid"] = configured_grid(self.camera, params, self.deepest_m, one_slice)
+            # Only where they are read: each precision of the G-buffer would compile the clusters again.
+            needs_normals = params.get("normal_bins", 0) or params.get("normal_cones", "implicit") == "explicit"
+            env["normals"] = env["gbuffer"].normal if needs_normals else None
         return env
 
 
@@ -168,8 +172,8 @@ def run_stages(
     """
     env = inputs.environment(config)
     n_runs = inputs.positions.z_m.shape[0]
-    grid_cells = n_cells(env["grid"], inputs.positions.viewport) if "grid" in env else 0
-    fitting = Sizes(rounded_up("cells", grid_cells), rounded_up("blocks", n_runs), rounded_up("pairs", 0))
+    grid_keys = n_keys(env["grid"], inputs.positions.viewport) if "grid" in env else 0
+    fitting = Sizes(rounded_up("cells", grid_keys), rounded_up("blocks", n_runs), rounded_up("pairs", 0))
     sizes = fitting.covering(sizes) if sizes else fitting
     for stage in REGISTRY[config.technique].stages:
         while True:
@@ -253,7 +257,7 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
         counts |= cluster_counts(lengths, n_cells(env["grid"], inputs.positions.viewport), inputs.n_lights)
         counts |= assign_counts(env["assign_counts"], inputs.n_lights, branching)
         rows = walk_rows(env["assign_counts"])
-    structures = [value for name, value in env.items() if name not in ("positions", "gbuffer", "grid", "light_cutoff")]
+    structures = [value for name, value in env.items() if name not in _NO_STRUCTURES]
     counts |= memory_counts(env["gbuffer"], structures, n_samples, counts.get("light_cluster_pairs", 0))
     return FrameCounts(counts, lengths.of_block, rows, branching, sizes), lengths
 

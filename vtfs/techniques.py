@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from vtfs.cluster_grid import ClusterGrid
-from vtfs.clusters import Bounds, Clusters, everything, form_clusters
+from vtfs.clusters import Bounds, Clusters, Unique, everything, form_clusters
 from vtfs.gbuffer import GBuffer, Positions
 from vtfs.light_assignment.brute_force import assign_brute_force
 from vtfs.light_assignment.light_tree import (
@@ -23,8 +23,10 @@ from vtfs.light_assignment.light_tree import (
     reduce_lights,
     sort_lights,
 )
+from vtfs.light_culling import Cull, LeafTest, needs_sections
 from vtfs.light_lists import AssignCounts, LightLists, ViewLights
 from vtfs.morton import morton_codes
+from vtfs.normal_cones import Components, ConeKind
 from vtfs.parameters import Configuration
 from vtfs.shading import Image, shade
 
@@ -41,6 +43,11 @@ class Plan:
     """
 
     bounds: Bounds = "implicit"
+    cull: Cull = "box"
+    leaf_test: LeafTest = "sphere"
+    unique: Unique = "page_table"
+    normal_cones: ConeKind = "implicit"
+    sections: bool = False
     branching: int = 0
     batch: int = 0
     cells: int = 0
@@ -52,7 +59,7 @@ class Plan:
 class Stage:
     """One step of a frame, timed apart.
 
-    - `needs`: inputs (`positions`, `gbuffer`, `grid`, `lights`, `light_cutoff`) and earlier stages.
+    - `needs`: inputs (`positions`, `gbuffer`, `grid`, `normals`, `lights`, `light_cutoff`) and earlier stages.
     - `statics`: the fields of `Plan` that its program depends on.
     """
 
@@ -80,6 +87,11 @@ class Technique:
         params = config.params
         return Plan(
             bounds=params.get("bounds", self.bounds),  # type: ignore[arg-type]
+            cull=params.get("cull", "box"),  # type: ignore[arg-type]
+            leaf_test=params.get("leaf_test", "sphere"),  # type: ignore[arg-type]
+            unique=params.get("unique", "page_table"),  # type: ignore[arg-type]
+            normal_cones=params.get("normal_cones", "implicit"),  # type: ignore[arg-type]
+            sections=needs_sections(params.get("cull", "box")),  # type: ignore[arg-type]
             branching=int(params.get("branching", 0)),
             batch=int(params.get("batch", 0)),
         )
@@ -88,8 +100,10 @@ class Technique:
 Assigned = tuple[LightLists, AssignCounts]
 
 
-def _clusters(plan: Plan, positions: Positions, grid: ClusterGrid) -> Clusters:
-    return form_clusters(positions, grid, plan.bounds, plan.cells, plan.blocks)
+def _clusters(plan: Plan, positions: Positions, grid: ClusterGrid, normals: Components | None) -> Clusters:
+    return form_clusters(
+        positions, grid, plan.bounds, plan.cells, plan.blocks, plan.unique, plan.sections, normals, plan.normal_cones
+    )
 
 
 _MAX_TESTS_AT_ONCE = 2**24  # their boxes take 400 MB
@@ -104,11 +118,12 @@ def walk_chunk(batch: int, branching: int, pairs: int) -> int:
 
 def _assign_brute_force(plan: Plan, lights: ViewLights, light_cutoff, clusters: Clusters) -> Assigned:
     chunk = walk_chunk(plan.batch, 32, plan.pairs)
-    return assign_brute_force(lights.spheres(light_cutoff), clusters, plan.pairs, chunk)
+    return assign_brute_force(lights.spheres(light_cutoff), clusters, plan.pairs, chunk, plan.cull, lights.cones)
 
 
 def _assign_tree(plan: Plan, tree: LightTree, clusters: Clusters) -> Assigned:
-    return assign_tree(tree, clusters, plan.pairs, walk_chunk(plan.batch, plan.branching, plan.pairs))
+    chunk = walk_chunk(plan.batch, plan.branching, plan.pairs)
+    return assign_tree(tree, clusters, plan.pairs, chunk, plan.cull, plan.leaf_test)
 
 
 def _reduce(plan: Plan, lights: ViewLights, light_cutoff):
@@ -124,7 +139,7 @@ def _sort(plan: Plan, codes):
 
 
 def _build_tree(plan: Plan, lights: ViewLights, light_cutoff, order) -> LightTree:
-    return build_light_tree(lights.spheres(light_cutoff), order, plan.branching)
+    return build_light_tree(lights.spheres(light_cutoff), order, plan.branching, lights.cones)
 
 
 def _shade(
@@ -144,7 +159,12 @@ def _all_lights(lights: ViewLights, clusters: Clusters) -> LightLists:
     return LightLists(zeros, zeros + n_lights, jnp.arange(n_lights), jnp.int32(n_lights), jnp.bool_(False))
 
 
-_CLUSTERS = Stage("clusters", _clusters, ("positions", "grid"), ("bounds", "cells", "blocks"))
+_CLUSTERS = Stage(
+    "clusters",
+    _clusters,
+    ("positions", "grid", "normals"),
+    ("bounds", "cells", "blocks", "unique", "sections", "normal_cones"),
+)
 _SHADE = Stage("shade_opaque", _shade, ("gbuffer", "lights", "light_cutoff", "clusters", "assign"), ("batch",))
 
 REGISTRY: dict[str, Technique] = {
@@ -157,7 +177,9 @@ REGISTRY: dict[str, Technique] = {
             "tiled_deferred",
             (
                 _CLUSTERS,
-                Stage("assign", _assign_brute_force, ("lights", "light_cutoff", "clusters"), ("batch", "pairs")),
+                Stage(
+                    "assign", _assign_brute_force, ("lights", "light_cutoff", "clusters"), ("batch", "pairs", "cull")
+                ),
                 _SHADE,
             ),
             one_slice=True,
@@ -171,7 +193,12 @@ REGISTRY: dict[str, Technique] = {
                 Stage("morton", _morton, ("lights", "light_cutoff", "reduce")),
                 Stage("sort", _sort, ("morton",)),
                 Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",)),
-                Stage("assign", _assign_tree, ("build_tree", "clusters"), ("branching", "batch", "pairs")),
+                Stage(
+                    "assign",
+                    _assign_tree,
+                    ("build_tree", "clusters"),
+                    ("branching", "batch", "pairs", "cull", "leaf_test"),
+                ),
                 _SHADE,
             ),
         ),
