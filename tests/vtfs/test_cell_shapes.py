@@ -1,4 +1,4 @@
-"""Spheres against the cells themselves: the exact test is that of float64 geometry, the others hold all that it does."""
+"""Spheres against the cells themselves: the exact test is that of float64 geometry, the others keep all it keeps."""
 
 import math
 

@@ -31,7 +31,7 @@ def unit(vectors):
 def normals_of_all_kinds(rng, n):
     """Anywhere, along axes, on the edges between faces of the cube and between bins."""
     normal = rng.normal(size=(n, 3))
-    normal[: n // 4] = rng.integers(-2, 3, (n // 4, 3)) + [[0, 0, 3]]
+    normal[: n // 4] = np.roll(rng.integers(-2, 3, (n // 4, 3)) + np.array([0, 0, 3]), rng.integers(3), axis=1)
     normal[n // 4 : n // 2] = rng.integers(-1, 2, (n // 4, 3)) + 1e-8 * rng.normal(size=(n // 4, 3))
     return unit(normal).astype(np.float32)
 
