@@ -1,4 +1,4 @@
-"""Every bounds, cull, scheme, lens and cone keeps each light that lights a sample; and the exact cull keeps few more."""
+"""No bounds, cull, scheme, lens or cone loses a light that lights a sample; the exact cull lists few others."""
 
 import math
 from dataclasses import replace
