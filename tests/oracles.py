@@ -215,3 +215,79 @@ def shading_work(of_block: list[int], chunk: int, capacity: int) -> tuple[int, i
             lanes += 32 * next(width for width in widths if width >= lit)
             steps += 1
     return lanes, steps
+
+
+def cell_corners(
+    edges: tuple[float, float, float, float], near_m: float, far_m: float, parallel: bool = False
+) -> np.ndarray:
+    """Corners of the cell between the slopes left, right, bottom, top and two depths: `[8, 3]`, near face first."""
+    left, right, bottom, top = edges
+    corners = []
+    for depth_m in (near_m, far_m):
+        width = 1.0 if parallel else depth_m
+        corners += [(x * width, y * width, -depth_m) for y in (bottom, top) for x in (left, right)]
+    return np.array(corners, np.float64)
+
+
+_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
+
+
+def distances_to_cell(point_m: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Distance of points `[N, 3]` to a convex body of six faces: 0 inside, else to the nearest face, `[N]`."""
+    centre = corners.mean(axis=0)
+    outside = np.zeros(len(point_m), bool)
+    nearest = np.full(len(point_m), np.inf)
+    for face in _FACES:
+        a, b, c, d = corners[list(face)]
+        normal = np.cross(b - a, d - a)
+        normal *= np.sign(normal @ (a - centre))
+        outside |= (point_m - a) @ normal > 0
+        for triangle in ((a, b, c), (a, c, d)):
+            nearest = np.minimum(nearest, _distances_to_triangle(point_m, triangle))
+    return np.where(outside, nearest, 0)
+
+
+def _distances_to_triangle(point_m: np.ndarray, triangle: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    a, b, c = triangle
+    normal = np.cross(b - a, c - a)
+    inside = np.ones(len(point_m), bool)
+    nearest = np.full(len(point_m), np.inf)
+    for p, q in ((a, b), (b, c), (c, a)):
+        inside &= np.cross(q - p, point_m - p) @ normal >= 0
+        share = np.clip((point_m - p) @ (q - p) / ((q - p) @ (q - p)), 0, 1)
+        nearest = np.minimum(nearest, np.linalg.norm(point_m - (p + share[:, None] * (q - p)), axis=1))
+    on_plane = np.abs((point_m - a) @ normal) / np.linalg.norm(normal)
+    return np.where(inside, on_plane, nearest)
+
+
+def projected_interval(centre: float, depth_m: float, radius_m: float, near_m: float) -> tuple[float, float] | None:
+    """Least and greatest `x / depth` of a disc beyond the near plane (Mara and McGuire 2013); `None` if it has no part
+    there."""
+    if depth_m + radius_m < near_m:
+        return None
+    slopes = []
+    square = centre**2 + depth_m**2 - radius_m**2
+    if square > 0:
+        for sign in (-1, 1):
+            # Where the tangents from the eye touch the disc.
+            cos, sin = math.sqrt(square), sign * radius_m
+            scale = math.sqrt(square) / (centre**2 + depth_m**2)
+            x, d = scale * (centre * cos - depth_m * sin), scale * (centre * sin + depth_m * cos)
+            if d >= near_m:
+                slopes.append(x / d)
+    if depth_m - radius_m < near_m:
+        half = math.sqrt(max(radius_m**2 - (near_m - depth_m) ** 2, 0))
+        slopes += [(centre - half) / near_m, (centre + half) / near_m]
+    return min(slopes), max(slopes)
+
+
+def distance_to_cone(point_m: np.ndarray, apex_m: np.ndarray, axis: np.ndarray, half_angle: float) -> float:
+    """Distance of a point to a solid cone: by the angle between its axis and the point."""
+    v = point_m - apex_m
+    length = float(np.linalg.norm(v))
+    if length == 0:
+        return 0.0
+    angle = math.atan2(float(np.linalg.norm(np.cross(axis, v))), float(axis @ v)) - half_angle
+    if angle <= 0:
+        return 0.0
+    return length * math.sin(angle) if angle < math.pi / 2 else length

@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 
 from vtfs.input_error import InputError
-from vtfs.parameters import PARAMETERS, TECHNIQUES, Configuration, Value, configuration
+from vtfs.parameters import PARAMETERS, TECHNIQUES, Configuration, ConflictError, Value, configuration
 
 LARGEST_SPACE = 100_000
 """More combinations than this are refused: counting them all would take hours."""
@@ -168,7 +168,10 @@ def _space(techniques: tuple[str, ...], values: Mapping[str, tuple[Value, ...]],
 
 def _combinations(technique: str, values: Mapping[str, tuple[Value, ...]]) -> Iterable[Configuration]:
     for chosen in itertools.product(*values.values()):
-        yield configuration(technique, dict(zip(values, chosen, strict=True)))
+        try:
+            yield configuration(technique, dict(zip(values, chosen, strict=True)))
+        except ConflictError:  # such as cubic cells of linear slices: no candidate
+            continue
 
 
 _ARITHMETIC = {

@@ -69,3 +69,47 @@ def box_of_sphere(sphere: Sphere) -> Aabb:
 
     (low_x, high_x), (low_y, high_y), (low_z, high_z) = map(extent, (sphere.x_m, sphere.y_m, sphere.z_m))
     return Aabb(low_x, low_y, low_z, high_x, high_y, high_z)
+
+
+def sphere_of_box(box: Aabb) -> Sphere:
+    """The sphere around a box: through its corners, grown by rounding."""
+    x_m, y_m, z_m = (
+        0.5 * (box.low_x_m + box.high_x_m),
+        0.5 * (box.low_y_m + box.high_y_m),
+        0.5 * (box.low_z_m + box.high_z_m),
+    )
+    dx, dy, dz = box.high_x_m - x_m, box.high_y_m - y_m, box.high_z_m - z_m
+    radius_m = jnp.sqrt(dx * dx + dy * dy + dz * dz) * (1 + SLACK)
+    return Sphere(x_m, y_m, z_m, radius_m + SLACK * (jnp.abs(x_m) + jnp.abs(y_m) + jnp.abs(z_m)))
+
+
+class Cone(eqx.Module):
+    """Solid cones without end; the apex is kept apart. Axes are unit vectors.
+
+    - `cos`, `sin`: of the half angle, from 0 to 180 degrees.
+    """
+
+    x: Float[Array, "*cones"]
+    y: Float[Array, "*cones"]
+    z: Float[Array, "*cones"]
+    cos: Float[Array, "*cones"]
+    sin: Float[Array, "*cones"]
+
+
+def sphere_meets_cone(sphere: Sphere, apex: Sphere, cone: Cone) -> Bool[Array, "*pairs"]:
+    """Does a sphere touch a cone whose apex is the centre of `apex`? Exact in its plane, at any half angle; the
+    published tests (Wronski 2017) measure to the cone's side only, also behind the apex. Touching counts.
+    """
+    vx, vy, vz = sphere.x_m - apex.x_m, sphere.y_m - apex.y_m, sphere.z_m - apex.z_m
+    along = vx * cone.x + vy * cone.y + vz * cone.z
+    # Not sqrt(v.v - along**2), which cancels for narrow cones.
+    ax, ay, az = vy * cone.z - vz * cone.y, vz * cone.x - vx * cone.z, vx * cone.y - vy * cone.x
+    aside = jnp.sqrt(ax * ax + ay * ay + az * az)
+    distance = jnp.sqrt(vx * vx + vy * vy + vz * vz)
+    beyond_side = aside * cone.cos - along * cone.sin
+    along_side = aside * cone.sin + along * cone.cos
+    size = jnp.abs(sphere.x_m) + jnp.abs(sphere.y_m) + jnp.abs(sphere.z_m)
+    size += jnp.abs(apex.x_m) + jnp.abs(apex.y_m) + jnp.abs(apex.z_m)
+    reach = sphere.radius_m + SLACK * size
+    # Where the foot on the cone's side lies behind the apex, the apex is nearest.
+    return (beyond_side <= 0) | (jnp.where(along_side >= 0, beyond_side, distance) <= reach)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 Vector = tuple[float, float, float]
 
 _LARGEST_SIDE_PX = 16384
+_LARGEST_SHIFT = 100
+_LENS_KEYS = ("shift_x", "shift_y", "orthographic_height_m")
+_NO_ANGLE_DEG = 60.0  # of a parallel projection, which has none: any valid one
 _LARGEST_FILE_BYTES = 256 * 2**20
 
 
@@ -52,10 +55,42 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Camera:
-    """A perspective view with square pixels.
+class Lens:
+    """What a projection has besides its angle.
 
-    - `fov_y_deg`: the full vertical angle.
+    - `shift_x`, `shift_y`: how far the image lies off the view direction, in widths and heights of the image: 0.5 puts
+      the view direction on its left (bottom) edge. For tiled renders, headsets and shift lenses.
+    - `orthographic_height_m`: height of the image of a parallel projection; 0: perspective.
+
+    **Raises:** `InputError` that names the field.
+    """
+
+    shift_x: float = 0.0
+    shift_y: float = 0.0
+    orthographic_height_m: float = 0.0
+
+    def __post_init__(self):
+        for name in ("shift_x", "shift_y"):
+            value = getattr(self, name)
+            if not abs(value) <= _LARGEST_SHIFT:
+                raise InputError(
+                    f"camera `{name}` = {value:g}: must lie between -{_LARGEST_SHIFT} and {_LARGEST_SHIFT}."
+                )
+        height_m = self.orthographic_height_m
+        if not (math.isfinite(height_m) and height_m >= 0):
+            raise InputError(
+                f"camera `orthographic_height_m` = {height_m:g}: must be above 0; leave it out for a perspective view."
+            )
+
+
+CENTRED = Lens()
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A view with square pixels: perspective, or parallel where its lens says so.
+
+    - `fov_y_deg`: the full vertical angle; without meaning in a parallel projection.
     - `near_m`, `far_m`: distances along -z of view space; `far_m` may be infinite.
 
     **Raises:** `InputError` that names the field where the view is degenerate.
@@ -68,6 +103,7 @@ class Camera:
     near_m: float
     far_m: float
     viewport: Viewport
+    lens: Lens = CENTRED
 
     def __post_init__(self):
         for name in ("eye_m", "target_m", "up"):
@@ -102,33 +138,62 @@ class Camera:
         return matrix
 
     @property
+    def is_orthographic(self) -> bool:
+        return self.lens.orthographic_height_m > 0
+
+    @property
     def tan_half_y(self) -> float:
+        """Half the image's height at depth 1; in a parallel projection at every depth, in metres."""
+        if self.is_orthographic:
+            return self.lens.orthographic_height_m / 2
         return math.tan(math.radians(self.fov_y_deg) / 2)
 
     @property
     def tan_half_x(self) -> float:
         return self.tan_half_y * self.viewport.width_px / self.viewport.height_px
 
+    @property
+    def slope_left(self) -> float:
+        """`x / depth` at the image's left edge (x itself in a parallel projection)."""
+        return (2 * self.lens.shift_x - 1) * self.tan_half_x
+
+    @property
+    def slope_top(self) -> float:
+        """`y / depth` at the image's top edge (y itself in a parallel projection)."""
+        return (2 * self.lens.shift_y + 1) * self.tan_half_y
+
     def pixel_slopes(self) -> tuple[np.ndarray, np.ndarray]:
-        """`x / depth` of every column and `y / depth` of every row at pixel centres: float64 `[w]`, `[h]`."""
+        """`x / depth` of every column and `y / depth` of every row at pixel centres: float64 `[w]`, `[h]`.
+
+        In a parallel projection they are x and y themselves.
+        """
         width, height = self.viewport.width_px, self.viewport.height_px
-        x = (2 * (np.arange(width) + 0.5) / width - 1) * self.tan_half_x
-        y = (1 - 2 * (np.arange(height) + 0.5) / height) * self.tan_half_y
+        x = (2 * (np.arange(width) + 0.5) / width - 1 + 2 * self.lens.shift_x) * self.tan_half_x
+        y = (1 - 2 * (np.arange(height) + 0.5) / height + 2 * self.lens.shift_y) * self.tan_half_y
         return x, y
 
     def primary_directions(self) -> np.ndarray:
-        """World-space directions through pixel centres, float64 `[h, w, 3]`.
+        """World-space directions through pixel centres, float64 `[h, w, 3]`, of a perspective view.
 
         Their depth in view space is 1, so that the parameter along such a ray is depth, not distance.
         """
+        self.require_perspective("primary rays")
         x, y = self.pixel_slopes()
         right, up, backward = self.view_from_world[:3, :3]
         return x[None, :, None] * right + y[:, None, None] * up - backward
 
+    def require_perspective(self, what: str) -> None:
+        """**Raises:** `InputError` that says `what` parallel projections do not have."""
+        if self.is_orthographic:
+            raise InputError(
+                f"camera `orthographic_height_m` = {self.lens.orthographic_height_m:g}: {what} need a perspective "
+                "view; leave it out and give `fov_y_deg`."
+            )
+
     @property
     def key(self) -> str:
         """SHA-256 of all fields, in hexadecimal."""
-        return hashlib.sha256(repr(asdict(self)).encode()).hexdigest()
+        return _digest(self)
 
 
 @dataclass(frozen=True)
@@ -140,6 +205,7 @@ class CameraPath:
     near_m: float
     far_m: float
     poses: tuple[Pose, ...]
+    lens: Lens = CENTRED
 
     def __post_init__(self):
         if not self.poses:
@@ -155,22 +221,33 @@ class CameraPath:
 
     def camera(self, i: int) -> Camera:
         pose = self.poses[i]
-        return Camera(pose.eye_m, pose.target_m, pose.up, self.fov_y_deg, self.near_m, self.far_m, self.viewport)
+        return Camera(
+            pose.eye_m, pose.target_m, pose.up, self.fov_y_deg, self.near_m, self.far_m, self.viewport, self.lens
+        )
 
     def resized(self, viewport: Viewport) -> CameraPath:
         """The same path for another image; the vertical angle stays."""
-        return CameraPath(viewport, self.fov_y_deg, self.near_m, self.far_m, self.poses)
+        return replace(self, viewport=viewport)
 
     @property
     def key(self) -> str:
         """SHA-256 of all fields, in hexadecimal."""
-        return hashlib.sha256(repr(asdict(self)).encode()).hexdigest()
+        return _digest(self)
+
+
+def _digest(view: Camera | CameraPath) -> str:
+    """Centred perspective views have the key that they had before there were other lenses: caches stay valid."""
+    record = asdict(view)
+    if view.lens == CENTRED:
+        del record["lens"]
+    return hashlib.sha256(repr(record).encode()).hexdigest()
 
 
 def load_cameras(path: Path | str) -> CameraPath:
     """Read `cameras.json`: `{"width", "height", "fov_y_deg", "near", "far", "frames": [{"eye", "target", "up"}]}`.
 
-    A missing `far`, or `null`, is infinite.
+    A missing `far`, or `null`, is infinite. Optional keys are those of `Lens`: `shift_x`, `shift_y`, and
+    `orthographic_height_m`, which stands in place of `fov_y_deg`.
 
     **Raises:** `InputError` that names the file and the key.
     """
@@ -178,13 +255,19 @@ def load_cameras(path: Path | str) -> CameraPath:
     record = _read_json(path)
     try:
         viewport = Viewport(_whole(record, "width"), _whole(record, "height"))
-        fov_y_deg, near_m = _number(record, "fov_y_deg"), _number(record, "near")
+        lens = Lens(*(_number(record, key) if key in record else 0.0 for key in _LENS_KEYS))
+        if lens.orthographic_height_m and "fov_y_deg" in record:
+            raise InputError("keys `fov_y_deg` and `orthographic_height_m`: a view has one of them; leave one out.")
+        if "orthographic_height_m" in record and not lens.orthographic_height_m:
+            raise InputError("key `orthographic_height_m` = 0: must be above 0; leave it out for a perspective view.")
+        fov_y_deg = _NO_ANGLE_DEG if lens.orthographic_height_m else _number(record, "fov_y_deg")
+        near_m = _number(record, "near")
         far_m = math.inf if record.get("far") is None else _number(record, "far")
         frames = record.get("frames")
         if not isinstance(frames, list):
             raise InputError(f"key `frames` = {_short(frames)}: must be a list of {{eye, target, up}}.")
         poses = tuple(_pose(frame, i) for i, frame in enumerate(frames))
-        return CameraPath(viewport, fov_y_deg, near_m, far_m, poses)
+        return CameraPath(viewport, fov_y_deg, near_m, far_m, poses, lens)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -194,10 +277,13 @@ def save_cameras(path: Path | str, camera_path: CameraPath) -> None:
 
     **Raises:** `InputError` where the file cannot be written.
     """
+    lens = {key: value for key, value in asdict(camera_path.lens).items() if value}
+    angle = {} if camera_path.lens.orthographic_height_m else {"fov_y_deg": camera_path.fov_y_deg}
     record = {
         "width": camera_path.viewport.width_px,
         "height": camera_path.viewport.height_px,
-        "fov_y_deg": camera_path.fov_y_deg,
+        **angle,
+        **lens,
         "near": camera_path.near_m,
         "far": camera_path.far_m if math.isfinite(camera_path.far_m) else None,
         "frames": [

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vtfs.cluster_grid import cluster_grid, n_cells
+from vtfs.cluster_grid import cluster_grid, configured_grid, n_cells, n_keys, tile_and_slices
 from vtfs.gbuffer import RUN_WIDTH_PX, Fragments, GBuffer, LayerTable, Positions, from_runs
 from vtfs.input_error import InputError
 from vtfs.light_lists import view_lights
@@ -37,6 +37,7 @@ from vtfs.techniques import REGISTRY, Plan, Stage, volume_chunk, walk_chunk
 from vtfs.view_samples import ViewSamples
 
 _BRUTE_FORCE_WORD = 32
+_NO_STRUCTURES = ("positions", "gbuffer", "normals", "grid", "light_cutoff")
 
 
 class CapacityError(InputError):
@@ -139,8 +140,10 @@ class FrameInputs:
             "light_cutoff": np.float32(params["light_cutoff"]),
         }
         if technique.lists == "clusters":
-            slices = 1 if technique.one_slice else int(params["depth_slices"])
-            env["grid"] = cluster_grid(self.camera, int(params["tile_px"]), slices, self.deepest_m)
+            env["grid"] = configured_grid(self.camera, params, self.deepest_m, technique.one_slice)
+            # Only where they are read: each precision of the G-buffer would compile the clusters again.
+            needs_normals = params.get("normal_bins", 0) or params.get("normal_cones", "implicit") == "explicit"
+            env["normals"] = env["gbuffer"].normal if needs_normals else None
         elif technique.lists == "light_volumes":  # for its pixels
             env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
         return env
@@ -207,10 +210,10 @@ def run_stages(
     env = inputs.environment(config)
     technique = REGISTRY[config.technique]
     n_runs = env["positions"].z_m.shape[0]
-    grid_cells = n_cells(env["grid"], inputs.viewport) if technique.lists == "clusters" else 0
+    grid_keys = n_keys(env["grid"], inputs.viewport) if technique.lists == "clusters" else 0
     if technique.two_lists and inputs.has_transparent:
-        grid_cells *= 2
-    fitting = Sizes(rounded_up("cells", grid_cells), rounded_up("blocks", n_runs), rounded_up("pairs", 0))
+        grid_keys *= 2
+    fitting = Sizes(rounded_up("cells", grid_keys), rounded_up("blocks", n_runs), rounded_up("pairs", 0))
     sizes = fitting.covering(sizes) if sizes else fitting
     for stage in technique.stages_of(inputs.has_transparent):
         while True:
@@ -305,13 +308,13 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
         counts |= assign_counts(env["assign_counts"], inputs.n_lights, branching)
         rows = walk_rows(env["assign_counts"])
         if technique.one_slice:
-            counts["lighting_computations_tile_area"] = counts["light_cluster_pairs"] * tile_px**2
+            tile_width_px, tile_height_px = tile_and_slices(config.params, inputs.viewport)[0]
+            counts["lighting_computations_tile_area"] = counts["light_cluster_pairs"] * tile_width_px * tile_height_px
     elif technique.lists == "light_volumes":
         light_runs = int(env["assign"].total)
         n_tests = inputs.n_lights * inputs.positions(with_hidden=False).n_visible_runs
         counts |= {"lights": inputs.n_lights, "leaf_tests": n_tests, "light_runs": light_runs}
-    given = ("positions", "gbuffer", "grid", "light_cutoff")
-    structures = [value for name, value in env.items() if name not in given]
+    structures = [value for name, value in env.items() if name not in _NO_STRUCTURES]
     counts |= memory_counts(env["gbuffer"], structures, fragments.n_samples, counts.get("light_cluster_pairs", 0))
     counts |= gbuffer_traffic(technique.reads_gbuffer, counts)
     frame_counts = FrameCounts(counts, lengths.of_block, lengths.n_solid_blocks, rows, light_runs, branching, sizes)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vtfs.bit_lists import last_not_above
-from vtfs.bounds import SLACK, Sphere
+from vtfs.bounds import SLACK, Cone, Sphere
 
 if TYPE_CHECKING:
     from vtfs.camera import Camera
@@ -19,12 +19,15 @@ if TYPE_CHECKING:
 
 POINT_COLUMNS, SPOT_COLUMNS = 8, 16
 
+_COS_SLACK = 1e-6
+
 
 class ViewLights(eqx.Module):
     """Lights in view space, float32.
 
     - `row`: what shading reads, one row a light: x, y, z, 1/range, r, g, b, range; where there are spots
-      eight more: direction x, y, z, 1/(cos_inner - cos_outer), cos_outer and padding.
+      eight more: direction x, y, z, 1/(cos_inner - cos_outer), cos_outer, cosine and sine of the cone to cull with
+      and padding.
     """
 
     row: Float[Array, "lights columns"]
@@ -41,6 +44,14 @@ class ViewLights(eqx.Module):
         x, y, z, range_m = (self.row[:, c] for c in (0, 1, 2, 7))
         radius_m = range_m * reach_of_cutoff(light_cutoff) + SLACK * (jnp.abs(x) + jnp.abs(y) + jnp.abs(z))
         return Sphere(jnp.where(range_m > 0, x, jnp.inf), y, z, radius_m)
+
+    @property
+    def cones(self) -> Cone | None:
+        """Where spots shine, a little wider; lights that shine everywhere have cones of 180 degrees. `None` where no
+        light is a spot."""
+        if self.row.shape[1] == POINT_COLUMNS:
+            return None
+        return Cone(*(self.row[:, c] for c in (8, 9, 10, 13, 14)))
 
 
 def reach_of_cutoff(light_cutoff: Float[Array, ""]) -> Float[Array, ""]:
@@ -65,11 +76,15 @@ def view_lights(lights: Lights, camera: Camera) -> ViewLights:
         relative.range_m[:, None],
     ]
     if relative.is_spot.any():
+        # Wider by what shading's cosine may be off in float32; the sine would cancel in float32 where cones are narrow.
+        cos_cull = np.clip(np.where(relative.is_spot, relative.cos_outer - _COS_SLACK, -1.0), -1, 1)
         columns += [
             relative.direction,
             (1 / (relative.cos_inner - relative.cos_outer))[:, None],
             relative.cos_outer[:, None],
-            np.zeros((relative.n_lights, SPOT_COLUMNS - POINT_COLUMNS - 5)),
+            cos_cull[:, None],
+            np.sqrt(1 - cos_cull * cos_cull)[:, None],
+            np.zeros((relative.n_lights, SPOT_COLUMNS - POINT_COLUMNS - 7)),
         ]
     return ViewLights(jax.device_put(np.concatenate(columns, axis=1).astype(np.float32)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -9,13 +10,20 @@ from vtfs.input_error import InputError
 
 Value = int | float | str
 
+GRID_OFF = "off"
+_GRID = re.compile(r"([1-9]\d{0,3})x([1-9]\d{0,3})x([1-9]\d{0,3})")
+
+
+class ConflictError(InputError):
+    """Values that are right by themselves and not together."""
+
 
 @dataclass(frozen=True)
 class Parameter:
     """One tunable parameter.
 
     Either `choices` lists its values, or it is a number in `[low, high]` (a whole one where `default`
-    is an `int`).
+    is an `int`), or, where `zero` says what it means, 0; `grid` is a text of its own.
     """
 
     name: str
@@ -24,14 +32,17 @@ class Parameter:
     choices: tuple[Value, ...] = ()
     low: float = 0.0
     high: float = 0.0
+    zero: str = ""
 
     @property
     def allowed(self) -> str:
         """The values, for a message to the user."""
         if self.choices:
             return ", ".join(str(choice) for choice in self.choices)
+        if isinstance(self.default, str):
+            return f'{GRID_OFF}, or columns x rows x slices as "16x9x24", up to 8192x8192x1024'
         kind = "a whole number" if isinstance(self.default, int) else "a number"
-        return f"{kind} from {self.low:g} to {self.high:g}"
+        return f"{kind} from {self.low:g} to {self.high:g}" + (f", or 0: {self.zero}" if self.zero else "")
 
     def parse(self, value: object) -> Value:
         """The value as the right type, from text or from a number.
@@ -49,7 +60,10 @@ class Parameter:
     def _holds(self, value: Value) -> bool:
         if self.choices:
             return value in self.choices
-        return not isinstance(value, str) and self.low <= value <= self.high
+        if isinstance(value, str):
+            named = grid_cells(value)
+            return value == GRID_OFF or bool(named and max(named[:2]) <= 8192 and named[2] <= 1024)
+        return self.low <= value <= self.high or bool(self.zero and value == 0)
 
 
 def _as_type(value: object, wanted: type) -> Value:
@@ -63,13 +77,28 @@ def _as_type(value: object, wanted: type) -> Value:
     return wanted(value)
 
 
+def grid_cells(grid: str) -> tuple[int, int, int] | None:
+    """Columns, rows and slices that a value of `grid` names; `None` where it is off, or names none."""
+    named = _GRID.fullmatch(grid)
+    return (int(named[1]), int(named[2]), int(named[3])) if named else None
+
+
 _BATCHES = (0, *(2**k for k in range(5, 25)))
 
 PARAMETERS: dict[str, Parameter] = {
     parameter.name: parameter
     for parameter in (
         Parameter("tile_px", 32, "width and height of a tile in pixels", low=2, high=256),
+        Parameter("tile_px_x", 0, "width of a tile in pixels", low=2, high=256, zero="tile_px"),
+        Parameter("tile_px_y", 0, "height of a tile in pixels", low=2, high=256, zero="tile_px"),
+        Parameter("grid", GRID_OFF, "tiles and slices by their number instead, as engines have them"),
         Parameter("depth_slices", 0, "depth slices of the grid; 0: as many as make cells cubic", low=0, high=1024),
+        Parameter(
+            "depth_scheme",
+            "self_similar",
+            "how slices grow: by a factor, not at all, or as the values of the depth buffer",
+            choices=("self_similar", "linear", "ndc"),
+        ),
         Parameter("branching", 32, "children of a node of the light tree", choices=(2, 4, 8, 16, 32, 64)),
         Parameter(
             "batch",
@@ -84,7 +113,33 @@ PARAMETERS: dict[str, Parameter] = {
             "depth pre-pass: without one, fragments are shaded that end up hidden",
             choices=("on", "off"),
         ),
-        Parameter("bounds", "implicit", "what stands for the samples of a cell", choices=("implicit", "explicit")),
+        Parameter(
+            "bounds",
+            "implicit",
+            "what stands for the samples of a cell: its box, their box, that in tenths of its own, the cell itself, "
+            "its part at their depths",
+            choices=("implicit", "explicit", "packed", "frustum", "depth_range"),
+        ),
+        Parameter(
+            "cull",
+            "box",
+            "light test of a tile or cell: projected rectangle, six planes, box, exact",
+            choices=("screen_rect", "planes", "box", "frustum"),
+        ),
+        Parameter(
+            "leaf_test",
+            "sphere",
+            "at the leaves of the tree: the light's sphere by `cull`, or its box against the cell's",
+            choices=("sphere", "box"),
+        ),
+        Parameter("unique", "page_table", "how occupied clusters are found", choices=("sort", "page_table")),
+        Parameter("normal_bins", 0, "bins of normals that split clusters, along a cube's edge; 0: none", low=0, high=8),
+        Parameter(
+            "normal_cones",
+            "implicit",
+            "cones that cull lights behind all surfaces of a cluster: of its bin, or of its samples",
+            choices=("implicit", "explicit"),
+        ),
         Parameter(
             "gbuffer",
             "float32",
@@ -95,19 +150,24 @@ PARAMETERS: dict[str, Parameter] = {
     )
 }
 
-_SHADING = ("batch", "gbuffer", "light_cutoff")
+_TILES = ("tile_px", "tile_px_x", "tile_px_y", "grid")
+_SLICES = ("depth_slices", "depth_scheme")
+_CLUSTERS = ("bounds", "cull", "unique", "normal_bins", "normal_cones")
+_SHADING = ("gbuffer", "light_cutoff")
+_BRUTE_FORCE = ("batch", *_CLUSTERS, *_SHADING)
+_BY_TREE = (*_TILES, *_SLICES, "branching", "batch", *_CLUSTERS, "leaf_test", *_SHADING)
 
 TECHNIQUES: dict[str, tuple[str, ...]] = {
-    "forward": ("prepass", *_SHADING),
-    "deferred": _SHADING,
-    "deferred_stencil": _SHADING,
-    "tiled_forward": ("tile_px", *_SHADING),
-    "tiled_forward_prez": ("tile_px", *_SHADING),
-    "tiled_deferred": ("tile_px", *_SHADING),
-    "clustered_deferred": ("tile_px", "depth_slices", "branching", "bounds", *_SHADING),
-    "clustered_forward": ("tile_px", "depth_slices", "branching", "bounds", *_SHADING),
-    "volume_tiled": ("tile_px", "depth_slices", *_SHADING),
-    "volume_tiled_bvh": ("tile_px", "depth_slices", "branching", "bounds", *_SHADING),
+    "forward": ("prepass", "batch", *_SHADING),
+    "deferred": ("batch", *_SHADING),
+    "deferred_stencil": ("batch", *_SHADING),
+    "tiled_forward": (*_TILES, "batch", "cull", *_SHADING),
+    "tiled_forward_prez": (*_TILES, *_BRUTE_FORCE),
+    "tiled_deferred": (*_TILES, *_BRUTE_FORCE),
+    "clustered_deferred": _BY_TREE,
+    "clustered_forward": _BY_TREE,
+    "volume_tiled": (*_TILES, *_SLICES, *_BRUTE_FORCE),
+    "volume_tiled_bvh": _BY_TREE,
 }
 """Techniques and the parameters each one has, in the order in which they are shown."""
 
@@ -115,6 +175,16 @@ TUNED_TECHNIQUES = ("forward", "tiled_deferred", "volume_tiled_bvh")
 """What a search compares unless the user says otherwise. Nothing is rasterised here, so that techniques which differ
 in their passes over the geometry run the same programs: `tiled_forward_prez` those of `tiled_deferred`,
 `clustered_forward` and `clustered_deferred` those of `volume_tiled_bvh`."""
+
+_OWN_DEFAULTS: dict[tuple[str, str], Value] = {
+    ("tiled_deferred", "bounds"): "depth_range",
+    ("tiled_forward_prez", "bounds"): "depth_range",
+}
+
+
+def default_value(technique: str, name: str) -> Value:
+    """What a technique does where the configuration does not say."""
+    return _OWN_DEFAULTS.get((technique, name), PARAMETERS[name].default)
 
 
 @dataclass(frozen=True)
@@ -135,7 +205,7 @@ class Configuration:
         return self.params[name]
 
     def __str__(self) -> str:
-        changed = [f"{name}={value}" for name, value in self.items if value != PARAMETERS[name].default]
+        changed = [f"{name}={value}" for name, value in self.items if value != default_value(self.technique, name)]
         return " ".join([self.technique, *changed])
 
     def replaced(self, **changes: Value) -> Configuration:
@@ -146,8 +216,10 @@ class Configuration:
 def configuration(technique: str, params: Mapping[str, object] | None = None) -> Configuration:
     """A complete, validated configuration; what `params` leaves out takes its default.
 
+    What has no effect beside other values takes its default: `tile_px` beside `grid`, say.
+
     **Raises:** `InputError` for an unknown technique, a parameter that the technique does not have,
-    or a value out of range.
+    or a value out of range; `ConflictError` for values that exclude each other.
     """
     if technique not in TECHNIQUES:
         raise InputError(f"technique `{technique}`: unknown; choose from {', '.join(TECHNIQUES)}.")
@@ -158,7 +230,47 @@ def configuration(technique: str, params: Mapping[str, object] | None = None) ->
             raise InputError(f"parameter `{name}`: unknown; `{technique}` has {', '.join(names)}.")
         if name not in names:
             raise InputError(f"parameter `{name}`: `{technique}` does not have it; it has {', '.join(names)}.")
-    return Configuration(
-        technique,
-        tuple((name, PARAMETERS[name].parse(given.get(name, PARAMETERS[name].default))) for name in names),
-    )
+    parsed = {name: PARAMETERS[name].parse(given.get(name, default_value(technique, name))) for name in names}
+    settled = _settled(technique, parsed)
+    return Configuration(technique, tuple((name, settled[name]) for name in names))
+
+
+def _settled(technique: str, params: dict[str, Value]) -> dict[str, Value]:
+    """The same for all values that do the same."""
+    params = dict(params)
+
+    def default(*names: str) -> None:
+        params.update({name: default_value(technique, name) for name in names if name in params})
+
+    named = grid_cells(str(params.get("grid", GRID_OFF)))
+    if named:
+        if "depth_slices" not in params and named[2] != 1:
+            raise ConflictError(
+                f"parameter `grid` = {params['grid']!r}: tiles of `{technique}` are not cut into slices; "
+                f'give "{named[0]}x{named[1]}x1".'
+            )
+        default(*_TILES[:3], "depth_slices")
+    elif "tile_px_x" in params:
+        width, height = params["tile_px_x"] or params["tile_px"], params["tile_px_y"] or params["tile_px"]
+        default(*_TILES[:3])
+        params |= {"tile_px": width} if width == height else {"tile_px_x": width, "tile_px_y": height}
+    if "depth_scheme" in params:
+        n_slices = named[2] if named else params["depth_slices"]
+        if n_slices == 1:
+            default("depth_scheme")
+        if n_slices == 0 and params["depth_scheme"] != "self_similar":
+            raise ConflictError(
+                f"parameter `depth_scheme` = {params['depth_scheme']!r} with depth_slices=0: cubic cells are "
+                "`self_similar`; give depth_slices of 1 or more."
+            )
+    if params.get("leaf_test") == "box":
+        default("cull")  # the sphere is not tested
+    if "cull" in params:
+        exact = params["cull"] == "frustum"
+        if params["bounds"] == "implicit" and exact:
+            params["bounds"] = "frustum"  # the exact test does not see the cell's box
+        elif params["bounds"] == "frustum" and params["cull"] == "box" and params.get("leaf_test") != "box":
+            params["cull"] = "frustum"  # nor is the cell a box
+        elif params["bounds"] == "frustum" and not exact:
+            params["bounds"] = "implicit"
+    return params

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from vtfs.cluster_grid import ClusterGrid
-from vtfs.clusters import Bounds, Clusters, everything, form_clusters
+from vtfs.clusters import Bounds, Clusters, Unique, everything, form_clusters
 from vtfs.gbuffer import GBuffer, LayerTable, Positions
 from vtfs.light_assignment.brute_force import assign_brute_force
 from vtfs.light_assignment.light_tree import (
@@ -24,9 +24,11 @@ from vtfs.light_assignment.light_tree import (
     reduce_lights,
     sort_lights,
 )
+from vtfs.light_culling import Cull, LeafTest, needs_sections
 from vtfs.light_lists import AssignCounts, LightLists, ViewLights
 from vtfs.light_volumes import LightPixels, draw_light_volumes, shade_light_volumes
 from vtfs.morton import morton_codes
+from vtfs.normal_cones import Components, ConeKind
 from vtfs.parameters import Configuration
 from vtfs.shading import Image, blend_layers, chunk_blocks, shade
 
@@ -45,6 +47,11 @@ class Plan:
 
     bounds: Bounds = "implicit"
     two_lists: bool = False
+    cull: Cull = "box"
+    leaf_test: LeafTest = "sphere"
+    unique: Unique = "page_table"
+    normal_cones: ConeKind = "implicit"
+    sections: bool = False
     branching: int = 0
     batch: int = 0
     cells: int = 0
@@ -56,7 +63,8 @@ class Plan:
 class Stage:
     """One step of a frame, timed apart.
 
-    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `lights`, `light_cutoff`) and earlier stages.
+    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`) and earlier
+      stages.
     - `statics`: the fields of `Plan` that its program depends on.
     """
 
@@ -96,6 +104,11 @@ class Technique:
         return Plan(
             bounds=params.get("bounds", self.bounds),  # type: ignore[arg-type]
             two_lists=self.two_lists,
+            cull=params.get("cull", "box"),  # type: ignore[arg-type]
+            leaf_test=params.get("leaf_test", "sphere"),  # type: ignore[arg-type]
+            unique=params.get("unique", "page_table"),  # type: ignore[arg-type]
+            normal_cones=params.get("normal_cones", "implicit"),  # type: ignore[arg-type]
+            sections=needs_sections(params.get("cull", "box")),  # type: ignore[arg-type]
             branching=int(params.get("branching", 0)),
             batch=int(params.get("batch", 0)),
         )
@@ -112,9 +125,19 @@ class Technique:
 Assigned = tuple[LightLists, AssignCounts]
 
 
-def _clusters(plan: Plan, positions: Positions, grid: ClusterGrid) -> Clusters:
-    two_lists = plan.two_lists and positions.n_transparent_runs > 0
-    return form_clusters(positions, grid, plan.bounds, plan.cells, plan.blocks, two_lists)
+def _clusters(plan: Plan, positions: Positions, grid: ClusterGrid, normals: Components | None) -> Clusters:
+    return form_clusters(
+        positions,
+        grid,
+        plan.bounds,
+        plan.cells,
+        plan.blocks,
+        plan.unique,
+        plan.sections,
+        normals,
+        plan.normal_cones,
+        plan.two_lists and positions.n_transparent_runs > 0,
+    )
 
 
 _MAX_TESTS_AT_ONCE = 2**24  # their boxes take 400 MB
@@ -129,11 +152,12 @@ def walk_chunk(batch: int, branching: int, pairs: int) -> int:
 
 def _assign_brute_force(plan: Plan, lights: ViewLights, light_cutoff, clusters: Clusters) -> Assigned:
     chunk = walk_chunk(plan.batch, 32, plan.pairs)
-    return assign_brute_force(lights.spheres(light_cutoff), clusters, plan.pairs, chunk)
+    return assign_brute_force(lights.spheres(light_cutoff), clusters, plan.pairs, chunk, plan.cull, lights.cones)
 
 
 def _assign_tree(plan: Plan, tree: LightTree, clusters: Clusters) -> Assigned:
-    return assign_tree(tree, clusters, plan.pairs, walk_chunk(plan.batch, plan.branching, plan.pairs))
+    chunk = walk_chunk(plan.batch, plan.branching, plan.pairs)
+    return assign_tree(tree, clusters, plan.pairs, chunk, plan.cull, plan.leaf_test)
 
 
 def _reduce(plan: Plan, lights: ViewLights, light_cutoff):
@@ -149,7 +173,7 @@ def _sort(plan: Plan, codes):
 
 
 def _build_tree(plan: Plan, lights: ViewLights, light_cutoff, order) -> LightTree:
-    return build_light_tree(lights.spheres(light_cutoff), order, plan.branching)
+    return build_light_tree(lights.spheres(light_cutoff), order, plan.branching, lights.cones)
 
 
 def _draw_volumes(stencil: bool, plan: Plan, positions: Positions, grid: ClusterGrid, lights: ViewLights, light_cutoff):
@@ -210,14 +234,21 @@ def _all_lights(lights: ViewLights, clusters: Clusters) -> LightLists:
     return LightLists(zeros, zeros + n_lights, jnp.arange(n_lights), jnp.int32(n_lights), jnp.bool_(False))
 
 
-_CLUSTERS = Stage("clusters", _clusters, ("positions", "grid"), ("bounds", "two_lists", "cells", "blocks"))
-_ASSIGN_BRUTE_FORCE = Stage("assign", _assign_brute_force, ("lights", "light_cutoff", "clusters"), ("batch", "pairs"))
+_CLUSTERS = Stage(
+    "clusters",
+    _clusters,
+    ("positions", "grid", "normals"),
+    ("bounds", "two_lists", "cells", "blocks", "unique", "sections", "normal_cones"),
+)
+_ASSIGN_BRUTE_FORCE = Stage(
+    "assign", _assign_brute_force, ("lights", "light_cutoff", "clusters"), ("batch", "pairs", "cull")
+)
 _ASSIGN_BY_TREE = (
     Stage("reduce", _reduce, ("lights", "light_cutoff")),
     Stage("morton", _morton, ("lights", "light_cutoff", "reduce")),
     Stage("sort", _sort, ("morton",)),
     Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",)),
-    Stage("assign", _assign_tree, ("build_tree", "clusters"), ("branching", "batch", "pairs")),
+    Stage("assign", _assign_tree, ("build_tree", "clusters"), ("branching", "batch", "pairs", "cull", "leaf_test")),
 )
 _LIGHTS = ("lights", "light_cutoff")
 _SHADE = (

@@ -273,7 +273,11 @@ def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def pixel_rays(camera: Camera, rows: slice) -> tuple[np.ndarray, np.ndarray]:
-    """`x / depth` and `y / depth` of the pixels of some rows, float64 `[rows * w]` each."""
+    """`x / depth` and `y / depth` of the pixels of some rows, float64 `[rows * w]` each.
+
+    **Raises:** `InputError` for a parallel view.
+    """
+    camera.require_perspective("primary rays")
     x, y = camera.pixel_slopes()
     y = y[rows]
     return np.tile(x, len(y)), np.repeat(y, len(x))

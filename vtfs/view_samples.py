@@ -294,6 +294,7 @@ def _gbuffer(arrays: dict[str, np.ndarray], camera: Camera) -> ViewSamples:
             raise InputError(f"key `{key}`: is missing; the file has {', '.join(arrays) or 'nothing known'}.")
     if "position" not in arrays and "depth" not in arrays:
         raise InputError(f"key `position` or `depth`: is missing; the file has {', '.join(arrays)}.")
+    camera.require_perspective("G-buffers")
     x, y = camera.pixel_slopes()
     depth_m = -arrays["position"][..., 2] if "position" in arrays else arrays["depth"]
     with np.errstate(invalid="ignore"):
@@ -347,8 +348,8 @@ def _check_pixels(position: np.ndarray, valid: np.ndarray, camera: Camera) -> No
     """Every valid position projects into its own pixel."""
     width, height = camera.viewport.width_px, camera.viewport.height_px
     with np.errstate(all="ignore"):
-        column = (position[..., 0] / -position[..., 2] / camera.tan_half_x + 1) * width / 2
-        row = (1 - position[..., 1] / -position[..., 2] / camera.tan_half_y) * height / 2
+        column = (position[..., 0] / -position[..., 2] - camera.slope_left) / camera.tan_half_x * width / 2
+        row = (camera.slope_top - position[..., 1] / -position[..., 2]) / camera.tan_half_y * height / 2
         off = np.maximum(np.abs(column - np.arange(width) - 0.5), np.abs(row - np.arange(height)[:, None] - 0.5))
     off = np.where(valid, off, 0)
     if off.max() > 0.5 + _SLACK_PX:

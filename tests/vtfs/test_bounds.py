@@ -1,5 +1,7 @@
 """Boxes and spheres: touching counts, rounding errs on its side, and what is empty meets nothing."""
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,7 +9,17 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests import oracles
-from vtfs.bounds import SLACK, Aabb, Sphere, box_of_sphere, boxes_meet, sphere_meets_box
+from vtfs.bounds import (
+    SLACK,
+    Aabb,
+    Cone,
+    Sphere,
+    box_of_sphere,
+    boxes_meet,
+    sphere_meets_box,
+    sphere_meets_cone,
+    sphere_of_box,
+)
 
 some = settings(max_examples=60, deadline=None)
 coordinates = st.floats(-1e5, 1e5, width=32)
@@ -96,3 +108,52 @@ def test_boxes_meet_as_intervals_do(a, size_a, b, size_b):
 def test_an_empty_box_meets_nothing():
     empty = Aabb(*(jnp.array([jnp.inf]),) * 3, *(jnp.array([-jnp.inf]),) * 3)
     assert not boxes_meet(empty, Aabb(*f32(-9, -9, -9, 9, 9, 9)))[0]  # type: ignore[arg-type]
+
+
+@given(corner=points, size=st.tuples(lengths, lengths, lengths))
+@some
+def test_the_sphere_of_a_box_holds_its_corners(corner, size):
+    low, high = box_from(corner, size)
+    sphere = sphere_of_box(Aabb(*f32(*low, *high)))  # type: ignore[arg-type]
+    centre = np.array([sphere.x_m, sphere.y_m, sphere.z_m], np.float64)[:, 0]
+    farthest = np.maximum(np.abs(low - centre), np.abs(high - centre))
+    assert np.linalg.norm(farthest) <= sphere.radius_m[0]
+    assert (
+        sphere.radius_m[0]
+        <= np.linalg.norm((high.astype(np.float64) - low) / 2) * 1.00001 + 1e-5 * np.abs([*low, *high]).sum()
+    )
+
+
+@given(
+    half_deg=st.one_of(st.sampled_from([0.5, 1.0, 45.0, 89.999, 90.0, 90.001, 179.9]), st.floats(0.5, 180)),
+    apex=points,
+    seed=st.integers(0, 2**32 - 1),
+    excess=st.floats(-1e-6, 1e-2),
+)
+@some
+def test_spheres_meet_cones_as_in_float64(half_deg, apex, seed, excess):
+    """Spheres that reach the cone, or its apex from behind, by less than rounding."""
+    rng = np.random.default_rng(seed)
+    apex = np.array(apex, np.float32).astype(np.float64)
+    axis = rng.normal(size=3)
+    axis = (axis / np.linalg.norm(axis)).astype(np.float32)
+    half = math.radians(half_deg)
+    centre = (apex + rng.normal(size=3) * 10 ** rng.uniform(-3, 5)).astype(np.float32).astype(np.float64)
+    if rng.random() < 0.2:
+        centre = (apex - axis * 10 ** rng.uniform(-2, 2)).astype(np.float32).astype(np.float64)
+    exact_axis = axis.astype(np.float64) / np.linalg.norm(axis.astype(np.float64))
+    distance = oracles.distance_to_cone(centre, apex, exact_axis, half)
+    radius = float(np.float32(distance * (1 + excess)))
+    cone = Cone(*f32(*axis, math.cos(half), math.sin(half)))  # type: ignore[arg-type]
+    found = bool(sphere_meets_cone(Sphere(*f32(*centre, radius)), Sphere(*f32(*apex, 1.0)), cone)[0])  # type: ignore[arg-type]
+    if distance <= radius:
+        assert found
+    slack = 3 * SLACK * (np.abs(centre).sum() + np.abs(apex).sum() + radius)
+    if found:
+        assert distance <= radius + slack
+
+
+def test_a_light_that_shines_everywhere_has_a_cone_of_all_directions():
+    cone = Cone(*f32(0, 0, -1, -1, 0))  # type: ignore[arg-type]
+    for centre in ((0, 0, 5), (0, 0, -5), (3, 0, 0), (0, 0, 0)):
+        assert sphere_meets_cone(Sphere(*f32(*centre, 0.0)), Sphere(*f32(0, 0, 0, 1)), cone)[0]  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from vtfs.camera import Camera, CameraPath, Pose, Viewport, default_cameras, load_cameras, save_cameras
+from vtfs.camera import Camera, CameraPath, Lens, Pose, Viewport, default_cameras, load_cameras, save_cameras
 from vtfs.gallery import build_scene
 from vtfs.input_error import InputError
 
@@ -93,6 +93,43 @@ def test_a_path_survives_its_file(tmp_path, far_m):
     assert path.key == load_cameras(tmp_path / "c.json").key != path.resized(Viewport(10, 20)).key
 
 
+def test_a_shifted_image_is_a_part_of_a_larger_one():
+    """The right half of a view is a view half as wide, shifted by half of its own width."""
+    whole = Camera(**GOOD)
+    half = replace(whole, viewport=Viewport(32, 36), lens=Lens(shift_x=0.5))
+    (x, y), (part_x, part_y) = whole.pixel_slopes(), half.pixel_slopes()
+    assert_allclose(part_x, x[32:], atol=1e-12)
+    assert_allclose(part_y, y)
+    assert half.slope_left == pytest.approx(0) and half.slope_top == whole.slope_top == pytest.approx(whole.tan_half_y)
+    up = replace(whole, lens=Lens(shift_y=0.5))
+    assert up.pixel_slopes()[1].min() > 0  # positive shifts show what is above and to the right
+
+
+def test_a_parallel_view_has_metres_for_slopes_and_no_primary_rays():
+    camera = replace(Camera(**GOOD), lens=Lens(orthographic_height_m=9.0))
+    x, y = camera.pixel_slopes()
+    assert x[0] == pytest.approx(-8 + 0.125) and y[0] == pytest.approx(4.5 - 0.125)
+    with pytest.raises(InputError, match="`orthographic_height_m` = 9: primary rays need a perspective view"):
+        camera.primary_directions()
+
+
+def test_lenses_change_keys_but_none_that_was_there_before():
+    camera = Camera(**GOOD)
+    assert camera.key == "3456a23c58d2b303187aa3e46eadb9096c7960e7a196b04a9ffb145be567d186"
+    others = [replace(camera, lens=lens).key for lens in (Lens(0.5), Lens(0, 0.5), Lens(0, 0, 2.0))]
+    assert len({camera.key, *others}) == 4
+
+
+@pytest.mark.parametrize("lens", [Lens(0.25, -1.5), Lens(orthographic_height_m=3.5), Lens(0.5, 0, 7.0)], ids=str)
+def test_a_lens_survives_its_file(tmp_path, lens):
+    path = CameraPath(
+        Viewport(320, 200), 60.0, 0.05, 9.0, (Pose((0.0, 1.0, 2.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),), lens
+    )
+    save_cameras(tmp_path / "c.json", path)
+    assert load_cameras(tmp_path / "c.json") == path
+    assert path.camera(0).lens == path.resized(Viewport(3, 2)).camera(0).lens == lens
+
+
 RECORD = {
     "width": 64,
     "height": 36,
@@ -113,6 +150,12 @@ RECORD = {
         ({"near": None}, "key `near` = None"),
         ({"fov_y_deg": True}, "key `fov_y_deg` = True"),
         ({"far": 0.1}, "frame 0: camera `far`"),
+        ({"shift_x": "left"}, "key `shift_x` = 'left': must be a number"),
+        ({"shift_y": 1e3}, "camera `shift_y` = 1000: must lie between -100 and 100"),
+        ({"shift_x": math.nan}, "camera `shift_x` = nan"),
+        ({"orthographic_height_m": 5}, "`fov_y_deg` and `orthographic_height_m`: a view has one"),
+        ({"orthographic_height_m": 0}, "`orthographic_height_m` = 0: must be above 0"),
+        ({"orthographic_height_m": -1}, "`orthographic_height_m` = -1: must be above 0"),
         ({"frames": []}, "at least one frame"),
         ({"frames": {"eye": 1}}, "`frames` = .*must be a list"),
         ({"frames": [7]}, r"`frames\[0\]` = 7"),

@@ -8,12 +8,13 @@ from hypothesis import strategies as st
 
 from tests import oracles
 from tests.strategies import SMALL, WIDE, positions_of, samples_in_slices, seeds
-from vtfs.cluster_grid import cluster_grid
+from vtfs.cluster_grid import cell_boxes, cluster_grid
 from vtfs.clusters import everything, form_clusters
+from vtfs.normal_cones import bin_of_normal
 
 some = settings(max_examples=8, deadline=None)
 CELLS, CAPACITY = 2**15, 2**12
-form = jax.jit(form_clusters, static_argnums=(2, 3, 4))
+form = jax.jit(form_clusters, static_argnums=(2, 3, 4, 5, 6, 8))
 
 
 @pytest.mark.parametrize(
@@ -83,3 +84,76 @@ def test_everything_is_one_cluster_of_all_runs():
     clusters = everything(positions_of(samples))
     assert int(clusters.n_clusters) == 1 and int(clusters.n_blocks) == 8 * 10
     assert (np.asarray(clusters.block_of_sample) == np.arange(80)[:, None]).all()
+
+
+@given(
+    tile_px=st.integers(2, 80),
+    n_slices=st.sampled_from([1, 7, 24]),
+    seed=seeds,
+    valid_share=st.sampled_from([0.0, 0.02, 0.8, 1.0]),
+)
+@some
+def test_sorting_finds_what_the_page_table_finds(tile_px, n_slices, seed, valid_share):
+    samples, _ = samples_in_slices(SMALL, n_slices, seed, valid_share)
+    grid, positions = cluster_grid(samples.camera, tile_px, n_slices, 0.0), positions_on_device(samples)
+    table, ordered = (form(positions, grid, "explicit", CELLS, CAPACITY, unique) for unique in ("page_table", "sort"))
+    n_blocks, n_clusters = int(table.n_blocks), int(table.n_clusters)
+    assert (int(ordered.n_blocks), int(ordered.n_clusters)) == (n_blocks, n_clusters)
+    for name, n in (("key", n_clusters), ("block_run", n_blocks), ("block_cluster", n_blocks)):
+        assert (np.asarray(getattr(table, name))[:n] == np.asarray(getattr(ordered, name))[:n]).all()
+    assert (np.asarray(table.block_of_sample) == np.asarray(ordered.block_of_sample))[np.asarray(positions.valid)].all()
+    for one, other in zip(jax.tree.leaves(table.box), jax.tree.leaves(ordered.box), strict=True):
+        assert (np.asarray(one)[:n_clusters] == np.asarray(other)[:n_clusters]).all()
+
+
+@given(tile_px=st.integers(2, 40), n_slices=st.sampled_from([1, 24]), seed=seeds)
+@some
+def test_packed_bounds_are_the_bits_of_each_axis(tile_px, n_slices, seed):
+    """10 bits an axis, one for each tenth of the cell's box that holds a sample (equations.md, section 1)."""
+    samples, slices = samples_in_slices(SMALL, n_slices, seed)
+    grid, positions = cluster_grid(samples.camera, tile_px, n_slices, 0.0), positions_on_device(samples)
+    packed = form(positions, grid, "packed", CELLS, CAPACITY)
+    columns, rows = -(-SMALL.width_px // tile_px), -(-SMALL.height_px // tile_px)
+    whole = np.array([np.asarray(side) for side in jax.tree.leaves(cell_boxes(grid, SMALL, packed.key))], np.float64)
+    found = np.array([np.asarray(side) for side in jax.tree.leaves(packed.box)], np.float64)
+    place = {int(key): n for n, key in enumerate(np.asarray(packed.key)[: int(packed.n_clusters)])}
+    for (k, j, i), pixels in oracles.cells(samples, tile_px, slices).items():
+        n = place[(k * rows + j) * columns + i]
+        inside = samples.position_m[tuple(np.transpose(pixels))].astype(np.float64)
+        low, high = whole[:3, n], whole[3:, n]
+        bit = (inside - low) / (high - low) * 10
+        assert (found[:3, n] <= inside.min(0)).all() and (inside.max(0) <= found[3:, n]).all()
+        # Within a thousandth of a bit's edge float32 may take the bit beside it.
+        least, most = np.floor(bit.min(0) - 1e-3), np.floor(bit.max(0) + 1e-3) + 1
+        assert (found[:3, n] >= low + (least - 1e-3) / 10 * (high - low)).all()
+        assert (found[3:, n] <= low + (most + 1e-3) / 10 * (high - low)).all()
+
+
+@pytest.mark.parametrize("normal_cones", ["implicit", "explicit"])
+@given(tile_px=st.integers(8, 80), normal_bins=st.integers(1, 4), seed=seeds)
+@some
+def test_bins_of_normals_split_cells(normal_cones, tile_px, normal_bins, seed):
+    samples, _ = samples_in_slices(SMALL, 7, seed)
+    grid, positions = (
+        cluster_grid(samples.camera, tile_px, 7, 0.0, "self_similar", normal_bins),
+        positions_on_device(samples),
+    )
+    normals = gbuffer_on_device(samples, positions, "float32").normal
+    whole = form(positions, cluster_grid(samples.camera, tile_px, 7, 0.0), "implicit", CELLS, CAPACITY)
+    split = form(positions, grid, "implicit", CELLS, CAPACITY, "sort", False, normals, normal_cones)
+    n_bins = 6 * normal_bins**2
+    valid = np.asarray(positions.valid)
+
+    def of_samples(clusters):
+        return np.asarray(clusters.block_cluster)[np.asarray(clusters.block_of_sample)]
+
+    cell, part = (np.asarray(c.key)[of_samples(c)][valid] for c in (whole, split))
+    index = np.asarray(bin_of_normal(np.int32(normal_bins), normals))[valid]
+    assert (part // n_bins == cell).all() and (part % n_bins == index).all()
+    assert split.cones is not None
+    cones = np.array([np.asarray(side) for side in jax.tree.leaves(split.cones)], np.float64)[:, of_samples(split)][
+        :, valid
+    ]
+    normal = np.array([np.asarray(component) for component in normals], np.float64)[:, valid]
+    cos = (cones[:3] * normal).sum(0) / np.linalg.norm(cones[:3], axis=0) / np.linalg.norm(normal, axis=0)
+    assert (cos >= cones[3]).all()

@@ -7,18 +7,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vtfs.input_error import InputError
-from vtfs.parameters import PARAMETERS, TECHNIQUES, configuration
+from vtfs.parameters import PARAMETERS, TECHNIQUES, ConflictError, configuration, default_value
 
 NOT_NUMBERS = ["abc", "", math.inf, -math.inf, math.nan, "nan", "inf", True, False, None, [], {}, 1j, 10**400, "1e999"]
 OUT_OF_RANGE = {
     "tile_px": [0, 1, 257, -32, 16.5, "16.5", 1e9],
+    "tile_px_x": [1, 257, -32, 16.5],
+    "tile_px_y": [1, 257, -32, 16.5],
     "depth_slices": [-1, 1025, 0.5],
+    "normal_bins": [-1, 9, 2.5],
     "branching": [0, 1, 3, 31, 128, 32.5, -2],
     "batch": [1, 16, 33, -32, 2**25, 1000],
     "light_cutoff": [-0.01, 0.995, 1, 2],
 }
 BAD_NUMBERS = [(name, value) for name, values in OUT_OF_RANGE.items() for value in [*values, *NOT_NUMBERS]]
-BAD_WORDS = [(name, value) for name in ("bounds", "gbuffer") for value in ["", "Implicit", "float64", 32, None, True]]
+WORDS = ("bounds", "gbuffer", "cull", "leaf_test", "unique", "depth_scheme", "normal_cones", "grid")
+BAD_WORDS = [(name, value) for name in WORDS for value in ["", "Implicit", "float64", 32, None, True]]
+BAD_WORDS += [
+    ("grid", value) for value in ["16x9", "0x9x24", "16x9x1025", "8193x1x1", "16 x 9 x 24", "16x9x24x2", "-1x9x2"]
+]
 
 
 @pytest.mark.parametrize(("name", "value"), BAD_NUMBERS + BAD_WORDS, ids=str)
@@ -36,7 +43,9 @@ def test_a_bad_value_is_refused_by_name_with_what_is_allowed(name, value):
         ("depth_slices", "a whole number from 0 to 1024"),
         ("branching", "2, 4, 8, 16, 32, 64"),
         ("light_cutoff", "a number from 0 to 0.99"),
-        ("bounds", "implicit, explicit"),
+        ("bounds", "implicit, explicit, packed, frustum, depth_range"),
+        ("tile_px_x", "a whole number from 2 to 256, or 0: tile_px"),
+        ("grid", 'off, or columns x rows x slices as "16x9x24", up to 8192x8192x1024'),
     ],
 )
 def test_what_is_allowed_reads_as_the_documentation_says(name, allowed):
@@ -54,7 +63,7 @@ def test_numbers_are_taken_as_text_and_as_whole_floats(tile_px):
 def test_every_technique_has_every_default(technique):
     config = configuration(technique)
     assert tuple(config.params) == TECHNIQUES[technique]
-    assert config.params == {name: PARAMETERS[name].default for name in TECHNIQUES[technique]}
+    assert config.params == {name: default_value(technique, name) for name in TECHNIQUES[technique]}
     assert str(config) == technique
     for value in config.params.values():
         assert type(value) in (int, float, str)
@@ -63,9 +72,16 @@ def test_every_technique_has_every_default(technique):
 def test_defaults_are_those_of_the_design():
     defaults = {name: parameter.default for name, parameter in PARAMETERS.items()}
     assert defaults == {
-        "tile_px": 32, "depth_slices": 0, "branching": 32, "batch": 0, "bounds": "implicit", "gbuffer": "float32",
-        "light_cutoff": 0.0, "prepass": "on",
+        "tile_px": 32, "tile_px_x": 0, "tile_px_y": 0, "grid": "off", "depth_slices": 0, "depth_scheme": "self_similar",
+        "branching": 32, "batch": 0, "bounds": "implicit", "cull": "box", "leaf_test": "sphere",
+        "unique": "page_table", "normal_bins": 0, "normal_cones": "implicit", "gbuffer": "float32", "light_cutoff": 0.0,
+        "prepass": "on",
     }  # fmt: skip
+    # Tiles had their samples' depths before there was a choice (Olsson and Assarsson 2011).
+    own = {(t, n): default_value(t, n) for t, names in TECHNIQUES.items() for n in names}
+    assert {key: value for key, value in own.items() if value != defaults[key[1]]} == {
+        ("tiled_deferred", "bounds"): "depth_range"
+    }
 
 
 def test_configurations_that_do_the_same_are_equal():
@@ -75,13 +91,58 @@ def test_configurations_that_do_the_same_are_equal():
     assert one.replaced(branching=32) == configuration("volume_tiled_bvh") != one
 
 
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ({"tile_px": 16, "grid": "16x9x24", "depth_slices": 7}, {"grid": "16x9x24"}),
+        ({"tile_px_x": 16, "tile_px_y": 16}, {"tile_px": 16}),
+        ({"tile_px": 8, "tile_px_x": 64, "tile_px_y": 16}, {"tile_px_x": 64, "tile_px_y": 16}),
+        ({"tile_px": 16, "tile_px_x": 64}, {"tile_px_x": 64, "tile_px_y": 16}),
+        ({"depth_slices": 1, "depth_scheme": "ndc"}, {"depth_slices": 1}),
+        ({"bounds": "frustum"}, {"cull": "frustum"}),
+        ({"bounds": "frustum", "cull": "planes"}, {"cull": "planes"}),
+        ({"leaf_test": "box", "cull": "planes"}, {"leaf_test": "box"}),
+        ({"leaf_test": "box", "bounds": "frustum"}, {"leaf_test": "box", "cull": "frustum"}),
+    ],
+    ids=str,
+)
+def test_values_without_effect_make_no_other_configuration(one, other):
+    first, second = configuration("volume_tiled_bvh", one), configuration("volume_tiled_bvh", other)
+    assert first == second and first.replaced() == first
+    assert first != configuration("volume_tiled_bvh")
+
+
+def test_values_with_an_effect_make_another_configuration():
+    changes = [
+        {}, {"cull": "planes"}, {"cull": "frustum"}, {"cull": "screen_rect"}, {"bounds": "explicit"}, {"tile_px_x": 16},
+        {"bounds": "explicit", "cull": "frustum"}, {"leaf_test": "box"}, {"grid": "16x9x24"}, {"grid": "9x16x24"},
+        {"tile_px_y": 16}, {"depth_slices": 24}, {"depth_slices": 24, "depth_scheme": "ndc"}, {"unique": "sort"},
+        {"normal_bins": 3}, {"normal_cones": "explicit"},
+    ]  # fmt: skip
+    assert len({configuration("volume_tiled_bvh", change) for change in changes}) == len(changes)
+
+
+@pytest.mark.parametrize("scheme", ["linear", "ndc"])
+def test_cubic_cells_are_self_similar_only(scheme):
+    with pytest.raises(ConflictError, match=f"`depth_scheme` = '{scheme}' with depth_slices=0.*1 or more"):
+        configuration("volume_tiled_bvh", {"depth_scheme": scheme})
+    assert configuration("volume_tiled_bvh", {"depth_scheme": scheme, "grid": "16x9x24"})["depth_scheme"] == scheme
+    assert configuration("volume_tiled_bvh", {"depth_scheme": scheme, "depth_slices": 2})["depth_scheme"] == scheme
+
+
+def test_a_tiled_technique_takes_a_grid_of_one_slice():
+    assert configuration("tiled_deferred", {"grid": "16x9x1"})["grid"] == "16x9x1"
+    with pytest.raises(ConflictError, match=r'`grid` = \'16x9x24\': tiles of `tiled_deferred` .*give "16x9x1"'):
+        configuration("tiled_deferred", {"grid": "16x9x24"})
+
+
 def test_an_unknown_technique_is_refused_with_those_there_are():
     with pytest.raises(InputError, match=r"technique `magic`: unknown; choose from forward, .*volume_tiled_bvh"):
         configuration("magic")
 
 
 def test_an_unknown_parameter_and_one_of_another_technique_are_refused():
-    with pytest.raises(InputError, match=r"parameter `tile`: unknown; `tiled_deferred` has tile_px, batch"):
+    with pytest.raises(InputError, match=r"parameter `tile`: unknown; `tiled_deferred` has tile_px, tile_px_x"):
         configuration("tiled_deferred", {"tile": 16})
     with pytest.raises(InputError, match=r"parameter `branching`: `tiled_deferred` does not have it; it has tile_px"):
         configuration("tiled_deferred", {"branching": 8})

@@ -144,7 +144,7 @@ def test_the_registry_and_the_parameters_name_the_same_techniques():
     assert tuple(REGISTRY) == tuple(TECHNIQUES)
     for name, technique in REGISTRY.items():
         assert technique.name == name and technique.stages[-1].name == "shade_transparent"
-        known = {"positions", "gbuffer", "layers", "grid", "lights", "light_cutoff"}
+        known = {"positions", "gbuffer", "layers", "grid", "normals", "lights", "light_cutoff"}
         for stage in technique.stages:
             assert set(stage.needs) <= known
             known.add(stage.name)

@@ -14,7 +14,7 @@ from vtfs.cli.options import JsonOption, VerboseOption, check_folder, set_log_le
 from vtfs.cli.scene_arguments import SceneArguments, with_scene
 from vtfs.cli.status import Status
 from vtfs.input_error import InputError
-from vtfs.parameters import PARAMETERS, TECHNIQUES, TUNED_TECHNIQUES, configuration
+from vtfs.parameters import TECHNIQUES, TUNED_TECHNIQUES, configuration, default_value
 
 
 @with_scene
@@ -121,9 +121,11 @@ def _command() -> str:
 
 def _recommendation(result: dict[str, Any]) -> str:
     best, gain = result["best"], result["gain"]
-    changed = [f"{name}={value}" for name, value in best["params"].items() if value != PARAMETERS[name].default]
+    changed = [
+        f"{name}={value}" for name, value in best["params"].items() if value != default_value(best["technique"], name)
+    ]
     low, high = best["time_ms_interval"]
-    lines = [f"{' '.join([best['technique'], *changed])}: {best['time_ms']:.1f} ms a frame ({low:.1f} to {high:.1f})"]
+    lines = [f"{' '.join([technique, *changed])}: {best['time_ms']:.1f} ms a frame ({low:.1f} to {high:.1f})"]
     for role, words in (("default", "its default"), ("fastest_default", "the fastest default")):
         if f"over_{role}" in gain:
             low, high = gain[f"over_{role}_interval"]

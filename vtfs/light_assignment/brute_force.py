@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 
 from vtfs.bit_lists import WORD_BITS, gather_hits
-from vtfs.bounds import Aabb, Sphere, sphere_meets_box
+from vtfs.bounds import Cone, Sphere
 from vtfs.clusters import Clusters
+from vtfs.light_culling import Cull, may_reach
 from vtfs.light_lists import AssignCounts, LightLists, lists_from_pairs
 from vtfs.wide_tree import in_leaf_nodes, n_leaf_nodes
 
@@ -14,7 +16,7 @@ _MAX_ROWS = 2**30  # the last chunk starts below 2^31
 
 
 def assign_brute_force(
-    lights: Sphere, clusters: Clusters, capacity: int, chunk: int
+    lights: Sphere, clusters: Clusters, capacity: int, chunk: int, cull: Cull = "box", cones: Cone | None = None
 ) -> tuple[LightLists, AssignCounts]:
     """Test all pairs, 32 lights a word (Olsson and Assarsson 2011; van Oosten 2017, Alg. 8.4).
 
@@ -24,11 +26,12 @@ def assign_brute_force(
     n_words = n_leaf_nodes(n_lights, WORD_BITS)
     x_m = in_leaf_nodes(lights.x_m, WORD_BITS, jnp.inf)
     y_m, z_m, radius_m = (in_leaf_nodes(c, WORD_BITS, 0.0) for c in (lights.y_m, lights.z_m, lights.radius_m))
+    cones = jax.tree.map(lambda c: in_leaf_nodes(c, WORD_BITS, 0.0), cones)
 
     def test(row):
         cluster, word = row // n_words, row % n_words
         sphere = Sphere(x_m[word], y_m[word], z_m[word], radius_m[word])
-        return sphere_meets_box(sphere, box_rows(clusters.box, cluster))
+        return may_reach(sphere, jax.tree.map(lambda c: c[word], cones), clusters, cluster, cull, "sphere")
 
     def emit(row, bit):
         return row // n_words, row % n_words * WORD_BITS + bit
@@ -40,15 +43,3 @@ def assign_brute_force(
     lists = lists_from_pairs(cluster, light, total, (total > capacity) | too_many, clusters.key.shape[0])
     none = jnp.zeros(0, jnp.int32)
     return lists, AssignCounts(none, none, n_rows, clusters.n_clusters)
-
-
-def box_rows(box: Aabb, row) -> Aabb:
-    """Some boxes as a column, to broadcast against each one's candidates."""
-    return Aabb(
-        box.low_x_m[row][:, None],
-        box.low_y_m[row][:, None],
-        box.low_z_m[row][:, None],
-        box.high_x_m[row][:, None],
-        box.high_y_m[row][:, None],
-        box.high_z_m[row][:, None],
-    )

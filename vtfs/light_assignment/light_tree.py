@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
-from vtfs.bounds import Aabb, Sphere, box_of_sphere, boxes_meet, sphere_meets_box
+from vtfs.bounds import Aabb, Cone, Sphere, box_of_sphere, boxes_meet
 from vtfs.clusters import Clusters
-from vtfs.light_assignment.brute_force import box_rows
+from vtfs.light_culling import Cull, LeafTest, box_rows, may_reach
 from vtfs.light_lists import AssignCounts, LightLists, lists_from_pairs
 from vtfs.morton import morton_codes
 from vtfs.sort_keys import sorted_order
@@ -23,12 +23,13 @@ from vtfs.wide_tree import WideTree, build_tree, in_leaf_nodes, walk
 class LightTree(eqx.Module):
     """A tree over lights in Morton order.
 
-    - `leaf`: one row a leaf node: x, y, z, radius of its lights; absent ones are at infinity.
+    - `leaf`: one row a leaf node: x, y, z, radius of its lights; absent ones are at infinity. Where there are spots,
+      the five components of `Cone` as well.
     - `light`: which light each place of the order is.
     """
 
     tree: WideTree
-    leaf: Float[Array, "leaves 4 branching"]
+    leaf: Float[Array, "leaves columns branching"]
     light: Int[Array, " lights"]
 
 
@@ -66,22 +67,32 @@ def order_lights(
     return jax.lax.cond(frame % resort_every == 0, sort_again, lambda: old_order)
 
 
-def build_light_tree(lights: Sphere, order: Int[Array, " lights"], branching: int) -> LightTree:
+def build_light_tree(
+    lights: Sphere, order: Int[Array, " lights"], branching: int, cones: Cone | None = None
+) -> LightTree:
     """Leaf rows and the boxes of all nodes, of lights in the given order."""
     ordered = Sphere(lights.x_m[order], lights.y_m[order], lights.z_m[order], lights.radius_m[order])
     rows = [in_leaf_nodes(ordered.x_m, branching, jnp.inf)]
     rows += [in_leaf_nodes(c, branching, 0.0) for c in (ordered.y_m, ordered.z_m, ordered.radius_m)]
+    rows += [in_leaf_nodes(c[order], branching, 0.0) for c in jax.tree.leaves(cones)]
     return LightTree(build_tree(box_of_sphere(ordered), branching), jnp.stack(rows, axis=1), order)
 
 
-def light_tree(lights: Sphere, branching: int) -> LightTree:
+def light_tree(lights: Sphere, branching: int, cones: Cone | None = None) -> LightTree:
     """All steps: reduce, Morton codes, sort, build."""
     low_m, high_m = reduce_lights(lights)
-    return build_light_tree(lights, sort_lights(morton_codes(lights, low_m, high_m)), branching)
+    return build_light_tree(lights, sort_lights(morton_codes(lights, low_m, high_m)), branching, cones)
 
 
-def assign_tree(lights: LightTree, clusters: Clusters, capacity: int, chunk: int) -> tuple[LightLists, AssignCounts]:
-    """Walk the clusters' boxes down the light tree; at the leaves the sphere decides.
+def assign_tree(
+    lights: LightTree,
+    clusters: Clusters,
+    capacity: int,
+    chunk: int,
+    cull: Cull = "box",
+    leaf_test: LeafTest = "sphere",
+) -> tuple[LightLists, AssignCounts]:
+    """Walk the clusters' boxes down the light tree; at the leaves the sphere decides, unless `leaf_test` is `box`.
 
     Lights are listed in Morton order.
     """
@@ -90,8 +101,9 @@ def assign_tree(lights: LightTree, clusters: Clusters, capacity: int, chunk: int
         return boxes_meet(children, box_rows(clusters.box, cluster))
 
     def keep(cluster, node):
-        row = lights.leaf[node]
-        return sphere_meets_box(Sphere(*(row[:, c] for c in range(4))), box_rows(clusters.box, cluster))
+        columns = [lights.leaf[node][:, c] for c in range(lights.leaf.shape[1])]
+        cone = Cone(*columns[4:]) if len(columns) > 4 else None
+        return may_reach(Sphere(*columns[:4]), cone, clusters, cluster, cull, leaf_test)
 
     found = walk(lights.tree, clusters.n_clusters, descend, keep, capacity, chunk)
     last = max(lights.light.shape[0] - 1, 0)
