@@ -83,7 +83,6 @@ class Technique:
 
     - `lists`: what its assignment makes: lists of lights for clusters, pixels for lights, or nothing.
     - `one_slice`: cells are whole tiles, whatever the depth.
-    - `bounds`: what stands for the samples of a cell where the configuration does not say.
     - `two_lists`: transparent samples have lists of their own.
     - `without_prepass`: fragments that end up hidden are shaded too; `forward` has a parameter for that.
     - `reads_gbuffer`: bytes go through a G-buffer: once for each sample, or once for each light on it.
@@ -93,7 +92,6 @@ class Technique:
     stages: tuple[Stage, ...]
     lists: Lists = "clusters"
     one_slice: bool = False
-    bounds: Bounds = "implicit"
     two_lists: bool = False
     without_prepass: bool = False
     reads_gbuffer: Literal["never", "per_sample", "per_light"] = "never"
@@ -102,7 +100,7 @@ class Technique:
         """The static part of a configuration, without capacities."""
         params = config.params
         return Plan(
-            bounds=params.get("bounds", self.bounds),  # type: ignore[arg-type]
+            bounds=params.get("bounds", "implicit"),  # type: ignore[arg-type]
             two_lists=self.two_lists,
             cull=params.get("cull", "box"),  # type: ignore[arg-type]
             leaf_test=params.get("leaf_test", "sphere"),  # type: ignore[arg-type]
@@ -289,12 +287,11 @@ REGISTRY: dict[str, Technique] = {
         _deferred("deferred", stencil=False),
         _deferred("deferred_stencil", stencil=True),
         Technique("tiled_forward", _TILED, one_slice=True, without_prepass=True),
-        Technique("tiled_forward_prez", _TILED, one_slice=True, bounds="depth_range", two_lists=True),
+        Technique("tiled_forward_prez", _TILED, one_slice=True, two_lists=True),
         Technique(
             "tiled_deferred",
             _TILED,
             one_slice=True,
-            bounds="depth_range",
             two_lists=True,
             reads_gbuffer="per_sample",
         ),

@@ -218,7 +218,7 @@ def test_boxes_and_sections_hold_the_samples_of_their_cells(lens, camera, tile, 
     width = 1 if camera.is_orthographic else depth_m[..., None].astype(np.float64)
     samples.position_m[..., :2] = slope * width
     grid = cluster_grid(camera, tile, n_slices, float(depth_m.max()), scheme)
-    key = oracles.as_image(keys_jit(grid, positions_on_device(samples)), SMALL)
+    key = oracles.as_image(keys_jit(grid, positions_of(samples)), SMALL)
     columns, rows = math.ceil(SMALL.width_px / tile[0]), math.ceil(SMALL.height_px / tile[1])
     y, x = np.mgrid[: SMALL.height_px, : SMALL.width_px]
     assert (key % columns == x // tile[0]).all() and (key // columns % rows == y // tile[1]).all()

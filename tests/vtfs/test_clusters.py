@@ -95,7 +95,7 @@ def test_everything_is_one_cluster_of_all_runs():
 @some
 def test_sorting_finds_what_the_page_table_finds(tile_px, n_slices, seed, valid_share):
     samples, _ = samples_in_slices(SMALL, n_slices, seed, valid_share)
-    grid, positions = cluster_grid(samples.camera, tile_px, n_slices, 0.0), positions_on_device(samples)
+    grid, positions = cluster_grid(samples.camera, tile_px, n_slices, 0.0), positions_of(samples)
     table, ordered = (form(positions, grid, "explicit", CELLS, CAPACITY, unique) for unique in ("page_table", "sort"))
     n_blocks, n_clusters = int(table.n_blocks), int(table.n_clusters)
     assert (int(ordered.n_blocks), int(ordered.n_clusters)) == (n_blocks, n_clusters)
@@ -111,7 +111,7 @@ def test_sorting_finds_what_the_page_table_finds(tile_px, n_slices, seed, valid_
 def test_packed_bounds_are_the_bits_of_each_axis(tile_px, n_slices, seed):
     """10 bits an axis, one for each tenth of the cell's box that holds a sample (equations.md, section 1)."""
     samples, slices = samples_in_slices(SMALL, n_slices, seed)
-    grid, positions = cluster_grid(samples.camera, tile_px, n_slices, 0.0), positions_on_device(samples)
+    grid, positions = cluster_grid(samples.camera, tile_px, n_slices, 0.0), positions_of(samples)
     packed = form(positions, grid, "packed", CELLS, CAPACITY)
     columns, rows = -(-SMALL.width_px // tile_px), -(-SMALL.height_px // tile_px)
     whole = np.array([np.asarray(side) for side in jax.tree.leaves(cell_boxes(grid, SMALL, packed.key))], np.float64)
@@ -136,9 +136,9 @@ def test_bins_of_normals_split_cells(normal_cones, tile_px, normal_bins, seed):
     samples, _ = samples_in_slices(SMALL, 7, seed)
     grid, positions = (
         cluster_grid(samples.camera, tile_px, 7, 0.0, "self_similar", normal_bins),
-        positions_on_device(samples),
+        positions_of(samples),
     )
-    normals = gbuffer_on_device(samples, positions, "float32").normal
+    normals = gbuffer_of(samples).normal
     whole = form(positions, cluster_grid(samples.camera, tile_px, 7, 0.0), "implicit", CELLS, CAPACITY)
     split = form(positions, grid, "implicit", CELLS, CAPACITY, "sort", False, normals, normal_cones)
     n_bins = 6 * normal_bins**2
