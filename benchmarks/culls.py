@@ -59,7 +59,7 @@ def main() -> None:
 
 def show(config: Configuration, inputs: FrameInputs, is_tiled: bool) -> None:
     env, _ = run_stages(config, inputs, until="assign")
-    found = listed_pairs(inputs.positions, env["clusters"], env["assign"], inputs.lights)
+    found = listed_pairs(env["positions"], env["clusters"], env["assign"], inputs.lights)
     implicit = config["bounds"] in ("implicit", "frustum") and config["normal_bins"] == 0
     exact = exact_pairs(config, inputs, env, found) if implicit and config["cull"] == "box" and not is_tiled else None
     over_exact = f"{found.listed / exact:6.3f} of {exact:,}" if exact else "     -"

@@ -9,7 +9,7 @@ from typing import Literal
 
 from reports import number_text
 from reports.run_folder import Gain, RunFolder, Timed
-from vtfs.parameters import PARAMETERS, TECHNIQUES, Value
+from vtfs.parameters import PARAMETERS, TECHNIQUES, Value, default_value
 
 CLAIM = "for this JAX implementation on this device; nothing is rasterised: frame times start at view samples"
 
@@ -136,7 +136,7 @@ def settings(technique: str, params: Mapping[str, Value]) -> tuple[Setting, ...]
     order = [name for name in TECHNIQUES.get(technique, ()) if name in params]
     order += [name for name in params if name not in order]
     return tuple(
-        Setting(name, params[name], PARAMETERS[name].default if name in PARAMETERS else None) for name in order
+        Setting(name, params[name], default_value(technique, name) if name in PARAMETERS else None) for name in order
     )
 
 

@@ -297,7 +297,7 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
         env, sizes = inputs.environment(config), NO_SIZES
     lengths = lengths_of(config, env, inputs)
     branching = int(config.params.get("branching", _BRUTE_FORCE_WORD))
-    tile_px = int(config.params.get("tile_px", PARAMETERS["tile_px"].default))
+    tile_px, _ = tile_and_slices({"tile_px": PARAMETERS["tile_px"].default} | config.params, inputs.viewport)
     fragments = inputs.fragments(technique.shades_hidden(config))
     counts = shading_counts(lengths, fragments.n_samples, fragments.n_transparent_samples, tile_px)
     counts |= {"hidden_fragments": fragments.n_samples - inputs.fragments(with_hidden=False).n_samples}
@@ -308,8 +308,7 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
         counts |= assign_counts(env["assign_counts"], inputs.n_lights, branching)
         rows = walk_rows(env["assign_counts"])
         if technique.one_slice:
-            tile_width_px, tile_height_px = tile_and_slices(config.params, inputs.viewport)[0]
-            counts["lighting_computations_tile_area"] = counts["light_cluster_pairs"] * tile_width_px * tile_height_px
+            counts["lighting_computations_tile_area"] = counts["light_cluster_pairs"] * tile_px[0] * tile_px[1]
     elif technique.lists == "light_volumes":
         light_runs = int(env["assign"].total)
         n_tests = inputs.n_lights * inputs.positions(with_hidden=False).n_visible_runs

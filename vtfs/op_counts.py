@@ -74,12 +74,18 @@ def _lengths(
     return ListLengths(of_sample, of_visible, of_cluster, of_block, n_solid_blocks)
 
 
-def shading_counts(lengths: ListLengths, n_samples: int, n_transparent_samples: int, tile_px: int) -> OpCounts:
+def shading_counts(
+    lengths: ListLengths, n_samples: int, n_transparent_samples: int, tile_px: tuple[int, int]
+) -> OpCounts:
     """Counts of shading that the technique has, whoever implements it.
 
     - `samples`: all that are shaded, the `transparent_samples` too.
     - `lighting_computations`: valid samples times their list's length.
     - `divergence`: over runs of 32 visible solid samples in tile order, 32 times the longest list: what warps pay.
+
+    **Arguments:**
+
+    - `tile_px`: width and height of a tile.
     """
     return {
         "samples": n_samples,
@@ -139,12 +145,14 @@ def gbuffer_traffic(reads: str, counts: OpCounts) -> OpCounts:
     return {"bytes_gbuffer_16": 36 * accesses, "bytes_gbuffer_32": 68 * accesses}
 
 
-def _divergence(of_sample: np.ndarray, tile_px: int) -> int:
+def _divergence(of_sample: np.ndarray, tile_px: tuple[int, int]) -> int:
     """Tiles row by row, samples of a tile row by row, cut into runs of 32 that do not cross tiles."""
     height, width = of_sample.shape
-    padded = np.pad(of_sample, ((0, -height % tile_px), (0, -width % tile_px)))
-    rows, columns = padded.shape[0] // tile_px, padded.shape[1] // tile_px
-    tiles = padded.reshape(rows, tile_px, columns, tile_px).transpose(0, 2, 1, 3).reshape(rows * columns, -1)
+    tile_width_px, tile_height_px = tile_px
+    padded = np.pad(of_sample, ((0, -height % tile_height_px), (0, -width % tile_width_px)))
+    rows, columns = padded.shape[0] // tile_height_px, padded.shape[1] // tile_width_px
+    tiles = padded.reshape(rows, tile_height_px, columns, tile_width_px).transpose(0, 2, 1, 3)
+    tiles = tiles.reshape(rows * columns, -1)
     runs = np.pad(tiles, ((0, 0), (0, -tiles.shape[1] % RUN))).reshape(-1, RUN)
     return int(runs.max(axis=1).sum(dtype=np.int64)) * RUN
 

@@ -48,7 +48,7 @@ def listed_lights(config, inputs):
     np.add.at(listed, (np.repeat(np.arange(len(count)), count), used), 1)
     assert listed.max(initial=0) <= 1  # never twice
     cluster = np.asarray(clusters.block_cluster)[np.asarray(clusters.block_of_sample)]
-    return listed > 0, oracles.as_image(cluster, inputs.positions.viewport)
+    return listed > 0, oracles.as_image(cluster, inputs.viewport)
 
 
 def check_none_is_missing(technique, params, samples, lights, light_cutoff=0.0):

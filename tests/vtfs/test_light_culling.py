@@ -142,7 +142,7 @@ def test_pairs_that_reach_are_those_of_a_loop_over_samples(case):
     lights = as_spots(samples, lights, 3) if spots else lights
     inputs = FrameInputs(samples, lights)
     env, _ = run_stages(config, inputs, until="assign")
-    found = listed_pairs(inputs.positions, env["clusters"], env["assign"], inputs.lights)
+    found = listed_pairs(env["positions"], env["clusters"], env["assign"], inputs.lights)
     expected = counted_slowly(samples, lights, config)
     # Spots whose edge passes a sample by 1e-4 of their angle: float32 directions decide a few of them.
     assert found.listed == expected.listed and abs(found.reaching - expected.reaching) <= (2 if spots else 0)

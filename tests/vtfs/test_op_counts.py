@@ -28,7 +28,7 @@ some = settings(max_examples=25, deadline=None)
 def test_divergence_is_the_longest_list_of_each_run_in_tile_order(viewport, tile_px, seed):
     rng = np.random.default_rng(seed)
     of_sample = rng.integers(0, 50, (viewport.height_px, viewport.width_px)) * (rng.random(1) < 0.9)
-    counts = shading_counts(ListLengths(of_sample, of_sample, np.zeros(1), np.zeros(7), 7), 123, 0, tile_px)
+    counts = shading_counts(ListLengths(of_sample, of_sample, np.zeros(1), np.zeros(7), 7), 123, 0, (tile_px, tile_px))
     assert counts["divergence"] == oracles.divergence(of_sample, tile_px)
     assert counts["lighting_computations"] == sum(int(n) for n in of_sample.ravel())
     assert counts["samples"] == 123 and counts["shading_blocks"] == 7
@@ -51,7 +51,7 @@ def test_caps_drop_what_is_above_them():
 def test_sums_beyond_32_bits_stay_exact(dtype):
     of_sample = np.full((1024, 1024), 2**20, dtype)
     lengths = ListLengths(of_sample, of_sample, np.full(2**13, 2**20, dtype), np.zeros(1), 1)
-    counts = shading_counts(lengths, 2**20, 0, 32) | cluster_counts(lengths, 2**31 - 1, 2**20)
+    counts = shading_counts(lengths, 2**20, 0, (32, 32)) | cluster_counts(lengths, 2**31 - 1, 2**20)
     assert counts["lighting_computations"] == counts["divergence"] == 2**40
     assert counts["light_cluster_pairs"] == 2**33 and counts["dropped_at_cap_1024"] == 2**13 * (2**20 - 1024)
     rows = jnp.int32(2**31 - 1)
@@ -80,7 +80,9 @@ def test_forward_lists_every_light_for_every_sample():
     gbuffer = gbuffer_of(samples, "float32")
     lengths = uniform_lengths(gbuffer.positions, 37)
     assert (lengths.of_sample == np.where(samples.valid, 37, 0)).all()
-    assert shading_counts(lengths, samples.n_valid, 0, 32)["lighting_computations"] == 37 * int(samples.valid.sum())
+    assert shading_counts(lengths, samples.n_valid, 0, (32, 32))["lighting_computations"] == 37 * int(
+        samples.valid.sum()
+    )
 
 
 @pytest.mark.parametrize(("precision", "channel_bytes"), [("float32", 4), ("float16", 2), ("bfloat16", 2)])
