@@ -84,7 +84,8 @@ def surface_positions(camera: Camera) -> Positions:
     depth_m = np.clip(depth_m, NEAR_M, FAR_M)
     channels = (x[None, :] * depth_m, y[:, None] * depth_m, -depth_m)
     x_m, y_m, z_m = (jnp.asarray(to_runs(channel.astype(np.float32))) for channel in channels)
-    return Positions(x_m, y_m, z_m, jnp.asarray(to_runs(np.ones(depth_m.shape, bool))), camera.viewport)
+    valid, place = jnp.asarray(to_runs(np.ones(depth_m.shape, bool))), jnp.arange(x_m.shape[0], dtype=jnp.int32)
+    return Positions(x_m, y_m, z_m, valid, place, camera.viewport)
 
 
 def lights_around(positions: Positions, n_lights: int) -> Sphere:

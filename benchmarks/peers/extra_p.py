@@ -1,3 +1,5 @@
+# The peers live in an environment of their own.
+# pyright: reportMissingImports=false
 """Extra-P on cases of one column from stdin; needs extrap 4.2.
 
 Run by `benchmarks/cost_models.py`, in an environment of its own. Cases of several columns come back as NaN: its

@@ -1,3 +1,5 @@
+# The peers live in an environment of their own.
+# pyright: reportMissingImports=false
 """XGBoost, Gaussian processes and a non-negative line on cases from stdin; needs xgboost, scikit-learn, scipy.
 
 Run by `benchmarks/cost_models.py`, in an environment of its own.

@@ -266,8 +266,8 @@ def test_a_damaged_record_is_refused():
 def broken_frames(monkeypatch, technique, break_):
     """Frames of a technique are what `break_` makes of their program's `(image, overflowed)`."""
 
-    def program(name, plan):
-        run = frame_program(name, plan)
+    def program(name, plan, has_transparent):
+        run = frame_program(name, plan, has_transparent)
         return (lambda env: break_(run(env))) if name == technique else run
 
     monkeypatch.setattr(tuning.workload, "frame_program", program)

@@ -1,3 +1,5 @@
+# NumPy arrays stand for those of the device.
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
 """Spheres against the cells themselves: the exact test is that of float64 geometry, the others keep all it keeps."""
 
 import math

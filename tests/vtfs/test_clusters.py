@@ -1,3 +1,5 @@
+# NumPy arrays stand for those of the device.
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
 """Occupied clusters, their bounds and their blocks, against a loop over samples."""
 
 import jax
@@ -7,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import oracles
-from tests.strategies import SMALL, WIDE, positions_of, samples_in_slices, seeds
+from tests.strategies import SMALL, WIDE, gbuffer_of, positions_of, samples_in_slices, seeds
 from vtfs.cluster_grid import cell_boxes, cluster_grid
 from vtfs.clusters import everything, form_clusters
 from vtfs.normal_cones import bin_of_normal

@@ -1,3 +1,5 @@
+# NumPy arrays stand for those of the device.
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
 """Bins and cones of normals: each holds its normals, and no light that is in front of a surface is behind its cone."""
 
 import jax

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests import oracles
 from tests.strategies import seeds
 from vtfs.bounds import Aabb, boxes_meet
-from vtfs.light_assignment.brute_force import box_rows
+from vtfs.light_culling import box_rows
 from vtfs.wide_tree import build_tree, inner_level_nodes, n_child_tests, n_leaf_nodes, walk
 
 SHAPES = [(1, 2), (37, 2), (64, 8), (65, 8), (37, 64), (513, 8)]

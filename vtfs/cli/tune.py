@@ -125,7 +125,7 @@ def _recommendation(result: dict[str, Any]) -> str:
         f"{name}={value}" for name, value in best["params"].items() if value != default_value(best["technique"], name)
     ]
     low, high = best["time_ms_interval"]
-    lines = [f"{' '.join([technique, *changed])}: {best['time_ms']:.1f} ms a frame ({low:.1f} to {high:.1f})"]
+    lines = [f"{' '.join([best['technique'], *changed])}: {best['time_ms']:.1f} ms a frame ({low:.1f} to {high:.1f})"]
     for role, words in (("default", "its default"), ("fastest_default", "the fastest default")):
         if f"over_{role}" in gain:
             low, high = gain[f"over_{role}_interval"]
