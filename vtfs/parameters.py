@@ -265,7 +265,7 @@ def _settled(technique: str, params: dict[str, Value]) -> dict[str, Value]:
             )
     if params.get("leaf_test") == "box":
         default("cull")  # the sphere is not tested
-    if "cull" in params:
+    if "cull" in params and "bounds" in params:
         exact = params["cull"] == "frustum"
         if params["bounds"] == "implicit" and exact:
             params["bounds"] = "frustum"  # the exact test does not see the cell's box

@@ -235,7 +235,7 @@ def test_values_that_fix_no_shape_compile_nothing(technique):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("branching", 4), ("batch", 2048), ("bounds", "explicit"), ("gbuffer", "float16")]
+    ("name", "value"), [("branching", 4), ("batch", 2048), ("bounds", "packed"), ("gbuffer", "float16")]
 )
 def test_values_that_fix_a_shape_compile_their_stages_and_no_others(name, value):
     config = a_config("volume_tiled_bvh")

@@ -80,7 +80,8 @@ def test_defaults_are_those_of_the_design():
     # Tiles had their samples' depths before there was a choice (Olsson and Assarsson 2011).
     own = {(t, n): default_value(t, n) for t, names in TECHNIQUES.items() for n in names}
     assert {key: value for key, value in own.items() if value != defaults[key[1]]} == {
-        ("tiled_deferred", "bounds"): "depth_range"
+        ("tiled_deferred", "bounds"): "depth_range",
+        ("tiled_forward_prez", "bounds"): "depth_range",
     }
 
 
