@@ -229,6 +229,8 @@ def _to_leaves(
         # A root with one child is no node of the tree: only the capacity's rounding made it.
         only = table.n_below[level] == 1
 
+        lanes_in = lists.triangle.shape[1]
+
         def test(triangle, node):
             row = table.row.at[jnp.asarray(first_row)[level] + node].get(mode="promise_in_bounds")
             planes = jax.tree.map(lambda c: c[:, None, :], gathered(volume.nodes, triangle))
@@ -238,8 +240,12 @@ def _to_leaves(
             pass_on = jnp.zeros((1, b, 1), bool).at[:, 0].set(True) & (triangle != absent)[:, None, :]
             goes_on = jnp.where(only, pass_on, goes_on)
             accepted = accepted & ~only
+            # Both answers in one word: two reductions would each repeat the tests.
+            shift = jnp.arange(lanes_in, dtype=jnp.uint64)
+            both = (goes_on.astype(jnp.uint64) << shift) | (accepted.astype(jnp.uint64) << (shift + 32))
+            both = jnp.sum(both, axis=-1, dtype=jnp.uint64)
             extra = jnp.where(only, 0, jnp.sum(refined, dtype=jnp.int32))
-            return pack_bits(goes_on)[..., 0], pack_bits(accepted)[..., 0], extra
+            return (both & 0xFFFFFFFF).astype(jnp.uint32), (both >> 32).astype(jnp.uint32), extra
 
         def drop(accepted):
             if not plan.feedback:
