@@ -13,11 +13,13 @@ accepted only where every sample in it would be.
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import dataclass
+from typing import Generic, Literal, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 Extra = Literal["off", "vertex", "silhouette"]
@@ -81,6 +83,12 @@ def minus(a: Vector, b: Vector) -> Vector:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
+def _corners(vertex_m: Vector, triangles: Int[Array, "n 3"]) -> tuple[Vector, Vector, Vector]:
+    """Vertices A, B and C of each triangle: one gather."""
+    corners = jnp.stack(vertex_m)[:, triangles]
+    return tuple(tuple(corners[c, :, k] for c in range(3)) for k in range(3))  # type: ignore[return-value]
+
+
 def _times(a: Vector, s: Float[Array, "*n"]) -> Vector:
     return a[0] * s, a[1] * s, a[2] * s
 
@@ -111,7 +119,7 @@ def edge_planes(
 
     **Returns:** the planes, and which triangles have a volume: not edge-on, without area or of unsafe orientation.
     """
-    corner = tuple(tuple(c[triangles[:, k]] for c in vertex_m) for k in range(3))
+    corner = _corners(vertex_m, triangles)
     index = tuple(triangles[:, k] for k in range(3))
     normals, offsets = [], []
     for k in range(3):
@@ -189,11 +197,8 @@ def node_planes(
     - `about_light`: nodes are given relative to the light: side planes hold the origin. Otherwise relative to the eye.
     """
 
-    def last(values):
-        return jnp.concatenate([values, jnp.zeros(1, values.dtype)])
-
     units = [_unit(normal) for normal in planes.normal]
-    corner = tuple(tuple(last(c[triangles[:, k]]) for c in vertex_m) for k in range(3))
+    corner = _corners(vertex_m, jnp.concatenate([triangles, jnp.zeros((1, 3), triangles.dtype)]))
     face = _unit(cross(minus(corner[1], corner[0]), minus(corner[2], corner[0])))
     away = -dot(face, light_m) if directional else dot(face, corner[0])
     face = _times(face, jnp.where(away < 0, -1.0, 1.0))
@@ -310,7 +315,30 @@ def test_nodes(planes: NodePlanes, node: tuple[Array, ...], is_frustum: bool, bi
     return refined, refined if kept is None else refined & kept, accepted
 
 
-def gathered(planes, index: Int[Array, "*n"]):
-    """The planes of some triangles, as contiguous arrays: a fused gather would be repeated for every node."""
-    picked = jax.tree.map(lambda table: table.at[index].get(mode="promise_in_bounds"), planes)
-    return jax.lax.optimization_barrier(picked)
+Planes = TypeVar("Planes", EdgePlanes, NodePlanes)
+
+
+class PlaneTable(eqx.Module, Generic[Planes]):
+    """All planes as one array, so that a single gather loads those of some triangles."""
+
+    values: Float[Array, "components n"]
+    layout: Planes = eqx.field(static=True)
+
+    def at(self, triangle: Int[Array, "*n"]) -> Planes:
+        """The planes of some triangles."""
+        rows = self.values.at[:, triangle].get(mode="promise_in_bounds")
+        leaves, structure = jax.tree.flatten(self.layout)
+        return jax.tree.unflatten(
+            structure, [row.astype(leaf.dtype) for row, leaf in zip(rows, leaves, strict=True)]
+        )
+
+
+def plane_table(planes: Planes) -> PlaneTable[Planes]:
+    leaves, structure = jax.tree.flatten(planes)
+    layout = jax.tree.unflatten(structure, [_Dtype(leaf.dtype) for leaf in leaves])
+    return PlaneTable(jnp.stack([leaf.astype(leaves[0].dtype) for leaf in leaves]), layout)
+
+
+@dataclass(frozen=True)
+class _Dtype:
+    dtype: np.dtype

@@ -16,10 +16,11 @@ from vtfs.shadow_volumes.planes import (
     PAD,
     EdgePlanes,
     NodePlanes,
+    PlaneTable,
     edge_planes,
-    gathered,
     inside,
     node_planes,
+    plane_table,
     test_nodes,
 )
 from vtfs.shadow_volumes.sample_tiles import SampleTiles, in_runs
@@ -41,8 +42,8 @@ class Volumes(eqx.Module):
     - `origin_m`: view space, float64; what planes and samples are relative to.
     """
 
-    edges: EdgePlanes
-    nodes: NodePlanes
+    edges: PlaneTable[EdgePlanes]
+    nodes: PlaneTable[NodePlanes]
     safe: Bool[Array, " triangles"]
     origin_m: tuple[Float[Array, ""], ...]
     bias_m: Float[Array, ""]
@@ -67,7 +68,7 @@ def volumes(frame: ShadowFrame, plan: ShadowPlan, about_light: bool) -> Volumes:
     light = rotated(*toward)
     edges, safe = edge_planes(vertex, frame.triangles, light, frame.directional, frame.bias_m, frame.culls_front)
     nodes = node_planes(edges, safe, vertex, frame.triangles, light, frame.directional, plan.extra, about_light)
-    return Volumes(edges, nodes, safe, tuple(zero) if frame.directional else light, frame.bias_m)
+    return Volumes(plane_table(edges), plane_table(nodes), safe, tuple(zero) if frame.directional else light, frame.bias_m)
 
 
 class NodeTable(eqx.Module):
@@ -233,7 +234,7 @@ def _to_leaves(
 
         def test(triangle, node):
             row = table.row.at[jnp.asarray(first_row)[level] + node].get(mode="promise_in_bounds")
-            planes = jax.tree.map(lambda c: c[:, None, :], gathered(volume.nodes, triangle))
+            planes = jax.tree.map(lambda c: c[:, None, :], volume.nodes.at(triangle))
             refined, goes_on, accepted = test_nodes(
                 planes, tuple(row[:, c, :, None] for c in range(6)), is_frustum, volume.bias_m.astype(jnp.float32)
             )
@@ -261,7 +262,7 @@ def _to_leaves(
             jnp.where(table.n_below[level] == 1, 0, tests),
             done.n_accepted,
             jnp.where(table.n_below[level] == 1, 0, done.n_refined),
-            done.extra if volume.nodes.extra else jnp.zeros_like(done.extra),
+            done.extra if plan.extra != "off" else jnp.zeros_like(done.extra),
             lists.n_groups,
         )
 
@@ -346,7 +347,7 @@ def _sample_rows(samples: SampleTiles, volume: Volumes) -> Float[Array, "tiles 4
 
 def _test_samples(
     lists: NodeLists,
-    edges: EdgePlanes,
+    edges: PlaneTable[EdgePlanes],
     sample_rows: Float[Array, "tiles 4 lanes"],
     tile_of_item: Int[Array, " items"],
     origin_m: tuple[Float[Array, ""], ...],
@@ -370,7 +371,7 @@ def _test_samples(
         position = tuple(row[:, c].astype(jnp.float64) - origin_m[c] for c in range(3))
         moved = row[:, 3].astype(jnp.float64)
         triangle = jax.lax.dynamic_slice_in_dim(lists.triangle, first, chunk)
-        planes = gathered(edges, triangle)
+        planes = edges.at(triangle)
         held = jnp.zeros((chunk, n_samples), bool)
         # One triangle after the other: the samples of a tile are the vector.
         for lane in range(lanes):
