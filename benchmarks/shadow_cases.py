@@ -40,7 +40,9 @@ def clumps_scene(n_triangles: int, seed: int = 0) -> Scene:
 
 
 def clumps_path() -> CameraPath:
-    return CameraPath(Viewport(1024, 1024), 60.0, 0.1, 400.0, (Pose((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),))
+    return CameraPath(
+        Viewport(1024, 1024), 60.0, 0.1, 400.0, (Pose((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),)
+    )
 
 
 def at_size(camera: Camera, size_px: int) -> Camera:

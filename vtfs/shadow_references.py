@@ -58,7 +58,7 @@ def brute_force(
     origin_m: np.ndarray | None = None,
     own_triangle: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Shadowed points, bool `[n]`: every triangle against every point in float64, by Moeller and Trumbore's test.
+    """Shadowed points, bool `[n]`: every triangle against every point in float64; points on an edge are inside.
 
     **Arguments:**
 
@@ -66,49 +66,53 @@ def brute_force(
     - `own_triangle`: the triangle that each point lies on, which does not shadow it; -1 for none.
     """
     origin = np.zeros(3) if origin_m is None else np.asarray(origin_m, np.float64)
-    a, b, c = (casters.vertices_m[casters.triangles[:, k]] - origin for k in range(3))
-    e1, e2 = b - a, c - a
-    homogeneous = light.homogeneous
-    start, way = _moved(points_m, homogeneous - np.append(origin, 0) * homogeneous[3], bias_m)
     shadowed = np.zeros(len(points_m), bool)
-    if not len(a):
+    if not casters.n_triangles or not len(points_m):
         return shadowed
-    longest = np.inf if light.directional else 1.0
-    n_points = max(1, min(len(points_m), _PAIRS_AT_ONCE // len(a)))
+    homogeneous = light.homogeneous - np.append(origin, 0) * light.homogeneous[3]
+    moved, _ = _moved(points_m, homogeneous, bias_m)
+    planes, behind = _volume_planes(casters, origin, homogeneous)
+    moved = moved if light.directional else moved - homogeneous[:3]
+    n_points = max(1, min(len(points_m), _PAIRS_AT_ONCE // casters.n_triangles))
 
     def test(first: int) -> None:
-        some = slice(first, first + n_points)
-        d, s = way[some, None], start[some, None] - a
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            p = _cross(d, e2)
-            determinant = _dot(e1, p)
-            u = _dot(s, p) / determinant
-            q = _cross(s, e1)
-            v = _dot(d, q) / determinant
-            t = _dot(e2, q) / determinant
-            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < longest) & (determinant != 0)
+        some = moved[first : first + n_points]
+        held = some @ planes[3].T > behind[3]
+        for normal, offset in zip(planes[:3], behind[:3], strict=True):
+            held &= some @ normal.T >= offset
         if own_triangle is not None:
-            hit &= own_triangle[some, None] != np.arange(len(a))
-        shadowed[some] = hit.any(axis=1)
+            own = own_triangle[first : first + n_points]
+            held[np.flatnonzero(own >= 0), own[own >= 0]] = False
+        shadowed[first : first + n_points] = held.any(axis=1)
 
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         list(threads.map(test, range(0, len(points_m), n_points)))
     return shadowed
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+def _volume_planes(
+    casters: Casters, origin_m: np.ndarray, light: np.ndarray
+) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """Inward normals `[T, 3]` of the three side planes and the triangle's, and the products that points inside exceed.
 
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.stack(
-        [
-            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
-            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
-            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
-        ],
-        axis=-1,
-    )
+    Of a triangle that the light sees edge-on, or that has no area, no point is inside.
+    """
+    a, b, c = (casters.vertices_m[casters.triangles[:, k]] - origin_m for k in range(3))
+    if light[3] == 0:
+        sides = [np.cross(light[:3], first - second) for first, second in ((b, c), (c, a), (a, b))]
+        offsets = [(n * v).sum(1) for n, v in zip(sides, (b, c, a), strict=True)]
+    else:
+        a, b, c = a - light[:3], b - light[:3], c - light[:3]
+        sides = [np.cross(b, c), np.cross(c, a), np.cross(a, b)]
+        offsets = [np.zeros(len(a))] * 3
+    face = np.cross(b - a, c - a)
+    away = -(face @ light[:3]) if light[3] == 0 else (face * a).sum(axis=1)
+    # What is seen edge-on up to rounding has no inside: its orientation would be noise.
+    size = sum(np.linalg.norm(n, axis=1) * np.linalg.norm(v, axis=1) for n, v in zip(sides, (a, b, c), strict=True))
+    sign = np.where(np.abs(away) > 1e-12 * size, np.sign(away), 0.0)[:, None]
+    height = np.where(sign[:, 0] != 0, (face * a).sum(axis=1) * sign[:, 0], np.inf)
+    planes = tuple(n * sign for n in (*sides, face))
+    return planes, (*(offset * sign[:, 0] for offset in offsets), height)
 
 
 class ShadowRays:

@@ -328,9 +328,7 @@ class PlaneTable(eqx.Module, Generic[Planes]):
         """The planes of some triangles."""
         rows = self.values.at[:, triangle].get(mode="promise_in_bounds")
         leaves, structure = jax.tree.flatten(self.layout)
-        return jax.tree.unflatten(
-            structure, [row.astype(leaf.dtype) for row, leaf in zip(rows, leaves, strict=True)]
-        )
+        return jax.tree.unflatten(structure, [row.astype(leaf.dtype) for row, leaf in zip(rows, leaves, strict=True)])
 
 
 def plane_table(planes: Planes) -> PlaneTable[Planes]:

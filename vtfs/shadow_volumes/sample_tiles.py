@@ -272,4 +272,3 @@ def relative_boxes(box: Aabb, origin_m: tuple[Float[Array, ""], ...]) -> Aabb:
 
     lows, highs = (box.low_x_m, box.low_y_m, box.low_z_m), (box.high_x_m, box.high_y_m, box.high_z_m)
     return Aabb(*map(relative, lows, origin_m), *map(relative, highs, origin_m))
-

@@ -68,7 +68,9 @@ def volumes(frame: ShadowFrame, plan: ShadowPlan, about_light: bool) -> Volumes:
     light = rotated(*toward)
     edges, safe = edge_planes(vertex, frame.triangles, light, frame.directional, frame.bias_m, frame.culls_front)
     nodes = node_planes(edges, safe, vertex, frame.triangles, light, frame.directional, plan.extra, about_light)
-    return Volumes(plane_table(edges), plane_table(nodes), safe, tuple(zero) if frame.directional else light, frame.bias_m)
+    return Volumes(
+        plane_table(edges), plane_table(nodes), safe, tuple(zero) if frame.directional else light, frame.bias_m
+    )
 
 
 class NodeTable(eqx.Module):
@@ -107,9 +109,7 @@ def node_table(items: Aabb, branching: int, is_frustum: bool) -> NodeTable:
     levels = (*inner_level_nodes(n_items, branching), n_leaf_nodes(n_items, branching))
     n_children = jnp.sum(exists, axis=1, dtype=jnp.int32)
     ends = np.cumsum(levels)
-    n_below = [
-        jnp.sum(n_children[end - nodes : end], dtype=jnp.int32) for nodes, end in zip(levels, ends, strict=True)
-    ]
+    n_below = [jnp.sum(n_children[end - nodes : end], dtype=jnp.int32) for nodes, end in zip(levels, ends, strict=True)]
     return NodeTable(row, n_children, jnp.stack(n_below), levels)
 
 
@@ -320,9 +320,7 @@ def _to_leaves(
 
         zeros = jnp.zeros(len(levels), jnp.int64)
         columns = (zeros, zeros, zeros, zeros, jnp.zeros(len(levels), jnp.int32))
-        lists, parent, shadowed, columns = jax.lax.fori_loop(
-            0, n_inner, inner, (lists, parent, shadowed, columns)
-        )
+        lists, parent, shadowed, columns = jax.lax.fori_loop(0, n_inner, inner, (lists, parent, shadowed, columns))
         at, n_children = int(first_child[n_inner]), n_leaf * b
         was = shadowed[at : at + n_children]
         done = step(lists, parent, was, n_inner, n_children, LEAF_LANES, plan.leaf_groups, chunk_groups)
