@@ -1,9 +1,9 @@
 """The walk of shadow volumes down a wide tree, by nodes: each node has the list of the triangles that may meet it.
 
-`wide_tree.walk` keeps pairs in order of queries. Here they are kept in order of nodes, which is what merging needs: whether any
-triangle accepts a node is a difference of two prefix sums, and the triangles of a leaf come out side by side. Lists are
-padded to groups of up to 32, so that one row of the tree is loaded for a group and its tests pack into one word a
-child. Nothing is scattered and nothing sorted.
+`wide_tree.walk` keeps pairs in order of queries. Here they are kept in order of nodes, which is what merging needs: whether
+any triangle accepts a node is a difference of two prefix sums, and the triangles of a leaf come out side by side. Lists
+are padded to groups, so that one row of the tree is loaded for a group and its tests pack into one word a child. Nothing
+is scattered and nothing sorted.
 """
 
 from __future__ import annotations
@@ -98,12 +98,16 @@ def split(
     n_in, lanes_in = lists.triangle.shape
     n_groups = jnp.minimum(lists.n_groups, n_in)
 
+    # One bisection for all groups: in a loop its many small steps would each be a call.
+    node_of_group = last_not_above(lists.start, jnp.arange(_whole_chunks(n_in, chunk), dtype=jnp.int32))
+    node_of_group = jnp.minimum(node_of_group, lists.count.shape[0] - 1)
+
     def test_chunk(first, n: int, before):
         group = first + jnp.arange(n, dtype=jnp.int32)
-        node = last_not_above(lists.start, group)
+        node = jax.lax.dynamic_slice_in_dim(node_of_group, first, n)
         triangle = jax.lax.dynamic_slice_in_dim(lists.triangle, first, n)
         triangle = jnp.where((group < n_groups)[:, None], triangle, absent)
-        goes_on, accepts, extra = test(triangle, jnp.minimum(node, lists.count.shape[0] - 1))
+        goes_on, accepts, extra = test(triangle, node)
         both = jnp.concatenate([n_bits_set(goes_on), n_bits_set(accepts)], axis=1)
         ends = jnp.cumsum(both, axis=0, dtype=jnp.int32) + before[None]
         return goes_on, ends - both, ends[-1], extra
@@ -113,7 +117,7 @@ def split(
         bits, below, totals, extra = test_chunk(jnp.int32(0), n_in, totals)
         extra = extra.astype(jnp.int64)
     else:
-        n_padded = -(-n_in // chunk) * chunk
+        n_padded = _whole_chunks(n_in, chunk)
 
         def loop(state):
             first, bits, below, totals, extra = state
@@ -152,14 +156,22 @@ def split(
     flat_below, flat_bits = below.reshape(-1), bits.reshape(-1)
     flat_triangle = lists.triangle.reshape(-1)
 
+    child_of_group = last_not_above(start, jnp.arange(_whole_chunks(capacity, chunk), dtype=jnp.int32))
+    child_of_group = jnp.minimum(child_of_group, kept.shape[0] - 1)
+
     def write_chunk(first, n: int):
         group = first + jnp.arange(n, dtype=jnp.int32)
-        child = jnp.minimum(last_not_above(start, group), kept.shape[0] - 1)
+        child = jax.lax.dynamic_slice_in_dim(child_of_group, first, n)
         node, which = child // branching, child % branching
         k = ((group - start[child]) * lanes)[:, None] + jnp.arange(lanes, dtype=jnp.int32)
         low, size = lists.start[node], lists.start[node + 1] - lists.start[node]
         wanted = at[node, which][:, None] + k
-        source = _last_not_above_in(flat_below, 2 * branching, which, low, size, wanted, widest, n_in)
+        # First where the group's first and last triangle come from; the others lie between.
+        ends = jnp.stack([wanted[:, 0], jnp.minimum(wanted[:, -1], at[node + 1, which] - 1)], axis=1)
+        ends = _last_not_above_in(flat_below, 2 * branching, which, low, size, ends, widest, n_in)
+        span = jnp.maximum(ends[:, 1] - ends[:, 0], 0) + 1
+        used = jnp.max(jnp.where(group < n_out, span, 1))
+        source = _last_not_above_in(flat_below, 2 * branching, which, ends[:, 0], span, wanted, used, n_in)
         word = flat_bits[source * branching + which[:, None]]
         bit = nth_bit_set(word, wanted - flat_below[source * 2 * branching + which[:, None]])
         triangle = flat_triangle[source * lanes_in + jnp.minimum(bit, lanes_in - 1)]
@@ -169,7 +181,7 @@ def split(
     if chunk >= capacity:
         triangle = write_chunk(jnp.int32(0), capacity)
     else:
-        n_padded = -(-capacity // chunk) * chunk
+        n_padded = _whole_chunks(capacity, chunk)
 
         def write(state):
             first, triangle = state
@@ -185,6 +197,10 @@ def split(
         jnp.sum(kept, dtype=jnp.int64),
         extra,
     )
+
+
+def _whole_chunks(n: int, chunk: int) -> int:
+    return n if chunk >= n else -(-n // chunk) * chunk
 
 
 def _last_not_above_in(flat, stride: int, column, low, size, value, widest, capacity: int):

@@ -36,19 +36,19 @@ def samples_beyond(kind: str, vertices: np.ndarray, light: np.ndarray, rng: np.r
 
 def covers(vertex_m, triangles, sample_m, fault):
     """In how many volumes each sample lies, by the test of the algorithms, or by a faulty one."""
-    planes, safe = edge_planes(vertex_m, triangles, vertex_m, False, 0.0, jnp.bool_(False))
+    planes, safe = edge_planes(vertex_m, triangles, vertex_m, False, jnp.float64(0), jnp.bool_(False))
     if fault == "float32":
         planes = jax.tree.map(lambda c: c.astype(jnp.float32) if c.dtype == jnp.float64 else c, planes)
         sample_m = tuple(c.astype(jnp.float32) for c in sample_m)
     elif fault == "sign":
         x, y, z = planes.normal[0]
-        planes = type(planes)(((-x, -y, -z), *planes.normal[1:]), (), planes.ties, (), planes.behind)
+        planes = type(planes)(((-x, -y, -z), *planes.normal[1:]), (), planes.least, (), planes.behind)
     elif fault == "no ties":
-        planes = type(planes)(planes.normal, (), planes.ties | 7, (), planes.behind)
+        planes = type(planes)(planes.normal, (), tuple(0 * c - 1e-300 for c in planes.least), (), planes.behind)
 
     def one(total, k):
         plane = jax.tree.map(lambda c: c[k], planes)
-        return total + inside(plane, sample_m, 0.0).astype(jnp.int32), None
+        return total + inside(plane, sample_m, jnp.float64(0)).astype(jnp.int32), None
 
     total, _ = jax.lax.scan(one, jnp.zeros(sample_m[0].shape, jnp.int32), jnp.arange(triangles.shape[0]))
     return total, safe

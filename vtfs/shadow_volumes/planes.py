@@ -32,10 +32,14 @@ SMALLEST_VOLUME = 1e-10
 vertices that it is summed from: it is seen edge-on, or narrower than 1e-10 rad. Rounding (2^-52) then moves the border of
 what is kept by at most 1e-5 of its size, and its orientation is certain."""
 
+BELOW_ZERO = -1e-300
+"""Below zero, above every product that is not zero, and no subnormal, which some devices take for zero."""
+
 PAD = 16 * 2.0**-24
 """Relative error bound of a float32 plane test: under eight roundings, each 2^-24, of every product; doubled."""
 
-Vector = tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]
+Vector = tuple[Array, ...]
+"""Components x, y and z."""
 
 
 class EdgePlanes(eqx.Module):
@@ -44,15 +48,16 @@ class EdgePlanes(eqx.Module):
     - `normal`: inward normals of the planes opposite vertex A, B and C, three components each; zero where the triangle
       casts nothing. Their dot products with a sample, divided by their sum, are barycentric coordinates.
     - `offset`: of these planes; zero for a point light.
-    - `ties`: bit i: a sample in plane i counts as inside.
+    - `least`: a sample is inside of a plane where its product is above this: 0, or just below it where the tie-break says
+      that a sample in the plane is inside.
     - `face`: normal of the triangle's plane, pointing away from a directional light; empty for a point light, where the sum
       of the three dot products stands for it.
     - `behind`: a sample is behind the plane where the face's product is above this.
     """
 
-    normal: tuple[Vector, Vector, Vector]
+    normal: tuple[Vector, ...]
     offset: tuple[Float[Array, " n"], ...]
-    ties: Int[Array, " n"]
+    least: tuple[Float[Array, " n"], ...]
     face: tuple[Float[Array, " n"], ...]
     behind: Float[Array, " n"]
 
@@ -65,7 +70,7 @@ class NodePlanes(eqx.Module):
     - `offset`: of the side planes, the face and the extra planes; of the face alone where the rest hold the origin.
     """
 
-    side: tuple[Vector, Vector, Vector]
+    side: tuple[Vector, ...]
     face: Vector
     extra: tuple[Vector, ...]
     offset: tuple[Float[Array, " n"], ...]
@@ -142,14 +147,11 @@ def edge_planes(
         return jnp.concatenate([values, jnp.full(1, absent, values.dtype)])
 
     normals = [_times(normal, inward) for normal in normals]
-    ties = jnp.zeros(index[0].shape, jnp.int32)
-    for k, (x, y, z) in enumerate(normals):
-        positive = (x > 0) | ((x == 0) & ((y > 0) | ((y == 0) & (z > 0))))
-        ties = ties | (positive.astype(jnp.int32) << k)
+    least = [jnp.where(_first_is_positive(normal), BELOW_ZERO, 0.0) for normal in normals]
     planes = EdgePlanes(
         tuple(tuple(map(last, normal)) for normal in normals),
         tuple(last(offset * inward) for offset in offsets) if directional else (),
-        last(ties),
+        tuple(last(value) for value in least),
         tuple(last(c) for c in _times(face, inward)) if directional else (),
         last((dot(face, corner[0]) + bias_m * volume if directional else volume) * inward, jnp.inf),
     )
@@ -169,8 +171,7 @@ def inside(planes: EdgePlanes, sample: Vector, moved: Float[Array, "*n"]) -> Boo
         distance = dot(normal, sample)
         if planes.offset:
             distance = distance - planes.offset[k]
-        tie = (planes.ties >> k & 1) == 1
-        within = (distance > 0) | ((distance == 0) & tie)
+        within = distance > planes.least[k]
         distances.append(distance)
         holds = within if holds is None else holds & within
     if planes.face:
@@ -241,6 +242,11 @@ def node_planes(
 def _unit(v: Vector) -> Vector:
     length = _length(v)
     return _times(v, jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0))
+
+
+def _first_is_positive(v: Vector) -> Bool[Array, " n"]:
+    """Is the first component that is not zero positive? On that side a sample in the plane is moved."""
+    return (v[0] > 0) | ((v[0] == 0) & ((v[1] > 0) | ((v[1] == 0) & (v[2] > 0))))
 
 
 def _over_length(value: Float[Array, " n"], v: Vector) -> Float[Array, " n"]:

@@ -26,13 +26,13 @@ from vtfs.shadow_volumes.planes import (
 from vtfs.shadow_volumes.sample_tiles import SampleTiles, in_runs
 from vtfs.wide_tree import build_tree, in_leaf_nodes, inner_level_nodes, n_leaf_nodes
 
-LANES = 32
-"""Triangles of a group on inner levels: their tests of a child pack into one word."""
+LANES = 16
+"""Triangles of a group on inner levels: both answers of their tests of a child pack into one word."""
 
 LEAF_LANES = 4
 """Triangles of a group at the leaves: short lists waste little, and a tile's samples are loaded once for four."""
 
-_ROWS_AT_ONCE, _SAMPLES_AT_ONCE = {"cpu": 2**14}, {"cpu": 2**17}
+_TRIANGLES_AT_ONCE, _SAMPLES_AT_ONCE = {"cpu": 2**15}, {"cpu": 2**18}
 """Triangles listed, and pairs of a triangle and a sample, in one chunk: what stays in the caches of a CPU."""
 
 
@@ -224,13 +224,11 @@ def _to_leaves(
     first_row = np.cumsum([0, *levels[:-1]]).astype(np.int32)
     # Children of a level begin here among all nodes below the root.
     first_child = np.cumsum([0, *levels[1:]]).astype(np.int32)
-    chunk_groups = max(1, _ROWS_AT_ONCE.get(jax.default_backend(), 0) // LANES)
+    chunk_groups = max(1, _TRIANGLES_AT_ONCE.get(jax.default_backend(), 0) // LANES)
 
     def step(lists: NodeLists, parent_shadowed, was_shadowed, level, n_children, lanes, capacity, chunk) -> Split:
         # A root with one child is no node of the tree: only the capacity's rounding made it.
         only = table.n_below[level] == 1
-
-        lanes_in = lists.triangle.shape[1]
 
         def test(triangle, node):
             row = table.row.at[jnp.asarray(first_row)[level] + node].get(mode="promise_in_bounds")
@@ -242,11 +240,11 @@ def _to_leaves(
             goes_on = jnp.where(only, pass_on, goes_on)
             accepted = accepted & ~only
             # Both answers in one word: two reductions would each repeat the tests.
-            shift = jnp.arange(lanes_in, dtype=jnp.uint64)
-            both = (goes_on.astype(jnp.uint64) << shift) | (accepted.astype(jnp.uint64) << (shift + 32))
-            both = jnp.sum(both, axis=-1, dtype=jnp.uint64)
+            shift = jnp.arange(LANES, dtype=jnp.uint32)
+            both = (goes_on.astype(jnp.uint32) << shift) | (accepted.astype(jnp.uint32) << (shift + LANES))
+            both = jnp.sum(both, axis=-1, dtype=jnp.uint32)
             extra = jnp.where(only, 0, jnp.sum(refined, dtype=jnp.int32))
-            return (both & 0xFFFFFFFF).astype(jnp.uint32), (both >> 32).astype(jnp.uint32), extra
+            return both & jnp.uint32(2**LANES - 1), both >> LANES, extra
 
         def drop(accepted):
             if not plan.feedback:
@@ -360,12 +358,13 @@ def _test_samples(
     one_pass = bool(plan.level_groups) or chunk >= capacity
     chunk = capacity if one_pass else chunk
 
+    n_padded = -(-capacity // chunk) * chunk
+    item = last_not_above(lists.start, jnp.arange(n_padded, dtype=jnp.int32))
+    tile = tile_of_item[jnp.minimum(item, tile_of_item.shape[0] - 1)]
+
     def test_chunk(first):
         group = first + jnp.arange(chunk, dtype=jnp.int32)
-        item = jnp.minimum(last_not_above(lists.start, group), tile_of_item.shape[0] - 1)
-        row = sample_rows.at[tile_of_item[item]].get(mode="promise_in_bounds")
-        if not one_pass:
-            row = jax.lax.optimization_barrier(row)
+        row = sample_rows.at[jax.lax.dynamic_slice_in_dim(tile, first, chunk)].get(mode="promise_in_bounds")
         position = tuple(row[:, c].astype(jnp.float64) - origin_m[c] for c in range(3))
         moved = row[:, 3].astype(jnp.float64)
         triangle = jax.lax.dynamic_slice_in_dim(lists.triangle, first, chunk)
@@ -379,7 +378,6 @@ def _test_samples(
     if one_pass:
         bits = test_chunk(jnp.int32(0))
     else:
-        n_padded = -(-capacity // chunk) * chunk
         pad = jnp.zeros((n_padded - capacity, lanes), jnp.int32)
         lists = NodeLists(jnp.concatenate([lists.triangle, pad]), lists.start, lists.count)
 
