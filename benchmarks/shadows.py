@@ -1,12 +1,12 @@
 """Shadow techniques against branching, tile size and Embree: time, tests and errors of every variant.
 
-python benchmarks/shadows.py --out DIR [--scene clumps|BUILT_IN|FILE] [--triangles 60000] [--cameras FILE] [--frame 0]
-    [--size 1024] [--minutes 8] [--variants cross|all|quick]
+python -m benchmarks.shadows --out DIR [--scene clumps|BUILT_IN|FILE] [--triangles 60000]
+    [--cameras FILE] [--frame 0] [--size 1024] [--minutes 8] [--variants cross|all|quick]
 
-One process. A configuration that fails, or for which no time is left, is a line of the table too. Each program runs from view
-samples to mask: clusters, hierarchy, planes, walk and merge; vertices, triangles and samples are on the device, nothing else is
-made before. Errors are samples outside the bands of `shadow_references.classify`, on at most 2,000 samples drawn at random
-and on all that differ from Embree.
+One process. A configuration that fails, or for which no time is left, is a line of the table too. Each program runs
+from view samples to mask: clusters, hierarchy, planes, walk and merge; vertices, triangles and samples are on the
+device, nothing else is made before. Errors are samples outside the bands of `shadow_references.classify`, on at most
+2,000 samples drawn at random and on all that differ from Embree.
 """
 
 from __future__ import annotations
@@ -82,19 +82,11 @@ def variants(which: str) -> Iterator[tuple[str, ShadowPlan]]:
     yield "cluster_hierarchy", ShadowPlan(8, 8, extra="off")
     yield "cluster_hierarchy", ShadowPlan(8, 8, feedback=False)
     yield "cluster_hierarchy", ShadowPlan(8, 8, bounds="implicit")
-    for technique, extra in (("cluster_hierarchy", "vertex"), ("ptsv", "silhouette")):
-        for branching in BRANCHINGS:
-            if branching not in (8, 32):
-                yield technique, ShadowPlan(8, branching, extra=extra)
-        for tile_px in TILES:
-            if tile_px != 8:
-                yield technique, ShadowPlan(tile_px, 8, extra=extra)
-    if which == "all":
-        for tile_px in TILES:
-            for branching in BRANCHINGS:
-                if tile_px != 8 and branching != 8:
-                    for technique, extra in (("cluster_hierarchy", "vertex"), ("ptsv", "silhouette")):
-                        yield technique, ShadowPlan(tile_px, branching, extra=extra)
+    crossed = [(8, b) for b in BRANCHINGS if b not in (8, 32)] + [(tile_px, 8) for tile_px in TILES if tile_px != 8]
+    rest = [(tile_px, b) for tile_px in TILES for b in BRANCHINGS if tile_px != 8 and b != 8]
+    for tile_px, branching in crossed + (rest if which == "all" else []):
+        yield "cluster_hierarchy", ShadowPlan(tile_px, branching)
+        yield "ptsv", ShadowPlan(tile_px, branching, extra="silhouette")
 
 
 def times_ms(run, seconds: float = 1.0, fewest: int = 5) -> list[float]:
@@ -193,7 +185,8 @@ def main() -> None:
                 result |= measure(case, technique, plan, by_rays)
                 counts = result["counts"]
                 print(
-                    f"{head}{result['time_ms']:>9.2f}{counts['test_and_set'] / 1e6:>9.2f}{counts['node_tests'] / 1e6:>8.2f}"
+                    f"{head}{result['time_ms']:>9.2f}{counts['test_and_set'] / 1e6:>9.2f}"
+                    f"{counts['node_tests'] / 1e6:>8.2f}"
                     f"{result['errors']:>7}{result['near_edge'] + result['near_plane']:>6}",
                     flush=True,
                 )

@@ -1,9 +1,9 @@
 """The walk of shadow volumes down a wide tree, by nodes: each node has the list of the triangles that may meet it.
 
-`wide_tree.walk` keeps pairs in order of queries. Here they are kept in order of nodes, which is what merging needs: whether
-any triangle accepts a node is a difference of two prefix sums, and the triangles of a leaf come out side by side. Lists
-are padded to groups, so that one row of the tree is loaded for a group and its tests pack into one word a child. Nothing
-is scattered and nothing sorted.
+`wide_tree.walk` keeps pairs in order of queries. Here they are kept in order of nodes, which is what merging needs:
+whether any triangle accepts a node is a difference of two prefix sums, and the triangles of a leaf come out side by
+side. Lists are padded to groups, so that one row of the tree is loaded for a group and its tests pack into one word a
+child. Nothing is scattered and nothing sorted.
 """
 
 from __future__ import annotations
@@ -65,12 +65,12 @@ def one_list(member: Bool[Array, " triangles"], lanes: int, absent: int) -> Node
 class Split(eqx.Module):
     """What one level did.
 
-    - `lists`: of the children; `accepted`: children that some triangle accepts.
+    - `lists`: of the children; `accepts`: how many triangles accept each child.
     - `n_accepted`: (triangle, child) pairs accepted; `n_refined`: pairs that went on; `extra`: see `Hits`.
     """
 
     lists: NodeLists
-    accepted: Bool[Array, " children"]
+    accepts: Int[Array, " children"]
     n_accepted: Int[Array, ""]
     n_refined: Int[Array, ""]
     extra: Int[Array, ""]
@@ -192,7 +192,7 @@ def split(
         triangle = triangle[:capacity]
     return Split(
         NodeLists(triangle, start, kept),
-        accepted,
+        accepts,
         jnp.sum(accepts, dtype=jnp.int64),
         jnp.sum(kept, dtype=jnp.int64),
         extra,

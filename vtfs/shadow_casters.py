@@ -23,7 +23,8 @@ FrontFaces = Literal["cast", "culled"]
 class Casters:
     """Triangles that cast shadows, in world space.
 
-    - `vertices_m`: float64 `[V, 3]`; `triangles`: int32 `[T, 3]`. Triangles that share an edge must share its vertices for
+    - `vertices_m`: float64 `[V, 3]`; `triangles`: int32 `[T, 3]`. Triangles that share an edge must share its vertices
+      for
       their volumes to be watertight.
 
     **Raises:** `InputError` where a vertex of a triangle is not finite or an index is out of range.

@@ -217,7 +217,8 @@ def _edge_angle(point: np.ndarray, corners: list[np.ndarray], light: np.ndarray,
         seen = [v - light[:3] for v in corners]
         for k in range(3):
             a, b = seen[k], seen[(k + 1) % 3]
-            # Angle to the arc between both directions: to its great circle where the point lies abreast, else to an end.
+            # Angle to the arc between both directions: to its great circle where the point lies abreast, else to an
+            # end.
             a = a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-300)
             b = b / np.maximum(np.linalg.norm(b, axis=1, keepdims=True), 1e-300)
             normal = np.cross(a, b)

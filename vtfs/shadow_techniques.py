@@ -27,6 +27,8 @@ from vtfs.shadow_mask import (
 from vtfs.shadow_volumes.cluster_hierarchy import cluster_hierarchy
 from vtfs.shadow_volumes.ptsv import ptsv
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
+from vtfs.shadow_volumes.z_fail import z_fail
+from vtfs.shadow_volumes.z_pass import z_pass
 from vtfs.view_samples import ViewSamples
 
 if TYPE_CHECKING:
@@ -36,7 +38,12 @@ log = logging.getLogger("vtfs.shadows")
 
 ShadowTechnique = Callable[[ShadowFrame, ShadowPlan], ShadowMask]
 
-SHADOW_TECHNIQUES: dict[str, ShadowTechnique] = {"ptsv": ptsv, "cluster_hierarchy": cluster_hierarchy}
+SHADOW_TECHNIQUES: dict[str, ShadowTechnique] = {
+    "z_pass": z_pass,
+    "z_fail": z_fail,
+    "ptsv": ptsv,
+    "cluster_hierarchy": cluster_hierarchy,
+}
 """Shadow techniques of one signature. What differs from one plan to another is in the plan."""
 
 _FIRST = ShadowPlan(clusters=2**12, groups=2**10, leaf_groups=2**13)
@@ -54,8 +61,8 @@ def shadow_grid(samples: ViewSamples, tile_px: int, depth_slices: int = 0) -> Cl
     n_slices = int(grid.depth_slices)
     if n_slices > 2**KEY_BITS:
         raise InputError(
-            f"tile_px={tile_px} with depth_slices={depth_slices} makes {n_slices:,} slices: shadow clusters have at most "
-            f"{2**KEY_BITS:,}; use larger tiles or fewer slices."
+            f"tile_px={tile_px} with depth_slices={depth_slices} makes {n_slices:,} slices: shadow clusters have at "
+            f"most {2**KEY_BITS:,}; use larger tiles or fewer slices."
         )
     return grid
 
@@ -63,7 +70,11 @@ def shadow_grid(samples: ViewSamples, tile_px: int, depth_slices: int = 0) -> Cl
 @functools.cache
 def counting_program(technique: str, plan: ShadowPlan) -> Callable[[ShadowFrame], ShadowMask]:
     """A technique as one program, from view samples to mask and counts; to be called inside `jax.enable_x64(True)`."""
-    return jax.jit(functools.partial(SHADOW_TECHNIQUES[technique], plan=plan))
+
+    def run(frame: ShadowFrame) -> ShadowMask:
+        return SHADOW_TECHNIQUES[technique](frame, plan)
+
+    return jax.jit(run)
 
 
 @functools.cache
@@ -198,9 +209,13 @@ def on_host(mask: ShadowMask, plan: ShadowPlan, frame: ShadowFrame) -> CastShado
 def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dict[str, int]:
     """Counts of a shadow technique.
 
-    - `test_and_set`: (existing node or valid sample, triangle) pairs tested; at leaves all samples of the tile, as in the papers.
-      `test_and_set_in_cluster` counts there only the samples of the cluster itself.
-    - `node_tests_0` ...: of them, on each level below the root; `accepted_*`, `refined_*` likewise, the rest is rejected.
+    - `test_and_set`: (existing node or valid sample, triangle) pairs tested; at leaves all samples of the tile, as in
+      the
+      papers. `test_and_set_in_cluster` counts there only the samples of the cluster itself. With a stencil: one for
+      each
+      sample and volume polygon that passes (z_pass) or fails (z_fail) the depth test; what the tiles cost stays apart.
+    - `node_tests_0` ...: of them, on each level below the root; `accepted_*`, `refined_*` likewise, the others are
+      rejected.
     - `extra_plane_tests`: planes tested beyond the four of a volume.
     - `memory`: bytes of the structures at their capacities.
     """
@@ -214,14 +229,16 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
         for name, column in (("node_tests", nodes), ("accepted", accepted), ("refined", refined))
         for level, value in enumerate(column)
     }
+    updates = int(counts.stencil_updates)
+    on_nodes = int(nodes.sum())
     lengths = np.asarray(counts.list_length).astype(np.int64)
     return {
         "samples": int(np.asarray(frame.receives).sum()),
         "casters": int(counts.n_casters),
         "items": int(counts.n_items),
-        "test_and_set": int(nodes.sum()) + int(counts.sample_tests),
-        "test_and_set_in_cluster": int(nodes.sum()) + int(counts.sample_tests_in_cluster),
-        "node_tests": int(nodes.sum()),
+        "test_and_set": updates if updates >= 0 else on_nodes + int(counts.sample_tests),
+        "test_and_set_in_cluster": updates if updates >= 0 else on_nodes + int(counts.sample_tests_in_cluster),
+        "node_tests": on_nodes,
         "sample_tests": int(counts.sample_tests),
         "extra_plane_tests": 3 * int(extra.sum()),
         "longest_list": int(lengths.max(initial=0)),

@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,7 +18,14 @@ from vtfs.gallery import build_scene
 from vtfs.input_error import InputError
 from vtfs.scene import load_scene
 from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, opaque_casters
-from vtfs.shadow_mask import ShadowPlan, casters_on_device, default_bias_m, facing_samples, shadow_frame
+from vtfs.shadow_mask import (
+    ShadowPlan,
+    casters_on_device,
+    default_bias_m,
+    edge_list,
+    facing_samples,
+    shadow_frame,
+)
 from vtfs.shadow_references import ShadowRays, brute_force, classify, facing_light, kept_casters, view_points_m
 from vtfs.shadow_techniques import cast_shadows, fitted, on_host, run_program, shadow_grid, shadow_program
 from vtfs.view_samples import ViewSamples, trace_view_samples
@@ -104,6 +112,56 @@ def test_a_directional_light_shadows_what_brute_force_says():
         bias_m = default_bias_m(casters)
         mask = cast("cluster_hierarchy", plan, samples, casters, light, bias_m).shadowed
         assert_equal_outside_the_bands(mask, samples, casters, light, bias_m, 0.01)
+
+
+def balls(camera: Camera, rng: np.random.Generator) -> Casters:
+    """Two closed balls and twenty loose triangles: always the same edges, as each number of them compiles."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    parts, triangles, n = [], [], 0
+    for _ in range(2):
+        parts.append(np.array(ball.vertices) * 10 ** rng.uniform(-0.5, 0.5) + rng.normal(size=3) * 6)
+        triangles.append(np.array(ball.faces) + n)
+        n += len(ball.vertices)
+    loose = rng.normal(size=(20, 1, 3)) * 6 + rng.normal(size=(20, 3, 3)) * 2
+    parts.append(loose.reshape(-1, 3))
+    triangles.append(n + np.arange(60).reshape(20, 3))
+    return Casters(np.concatenate(parts) + camera.eye_m, np.concatenate(triangles))
+
+
+@pytest.mark.parametrize("technique", ["z_pass", "z_fail"])
+def test_stencils_shadow_what_brute_force_says(technique):
+    n_shadowed = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        camera = a_camera(SMALL, eye_m=((1.0, 2.0, 3.0), (1e6, -3e5, 1e6))[seed % 2])
+        samples, casters = surface_samples(camera, seed), balls(camera, rng)
+        light = light_of(camera, ("inside", "far", "near")[seed % 3], rng)
+        bias_m = default_bias_m(casters)
+        receives = samples.valid.copy()
+        if technique == "z_pass":  # it has no caps: only what the eye sees is right
+            eye = ShadowLight(camera.eye_m)
+            points = view_points_m(samples, samples.valid)
+            receives[samples.valid] = ~brute_force(points, casters, eye, 0.0, np.array(camera.eye_m))
+        found = cast(technique, CLUSTERS, samples, casters, light, bias_m, receives=receives)
+        assert_equal_outside_the_bands(found.shadowed, samples, casters, light, bias_m, 0.02, receives)
+        n_shadowed += found.shadowed.sum()
+        assert found.counts["test_and_set"] >= found.shadowed.sum()
+    assert n_shadowed > 100
+
+
+def test_each_edge_is_listed_once_with_its_two_triangles():
+    #  0-1-2 and 0-2-3 share 0-2; 4 hangs on 0-2 too; 2, 2, 3 is no triangle
+    triangles = np.array([[0, 1, 2], [0, 2, 3], [2, 0, 4], [2, 2, 3]], np.int32)
+    edges = edge_list(triangles)
+    assert edges.dtype == np.int32
+    found = {tuple(edge) for edge in edges.tolist()}
+    assert {(0, 1, 0, -1), (1, 2, 0, -1), (0, 3, 3, -1), (0, 4, 4, -1), (2, 4, 5, -1), (2, 3, 2, 6)} < found
+    shared = sorted(edge for edge in found if edge[:2] == (0, 2))
+    assert [edge[2:] for edge in shared] in ([(1, 2), (5, -1)], [(1, 2), (4, -1)])
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    closed = edge_list(np.array(ball.faces, np.int32))
+    assert len(closed) == len(ball.edges_unique) and (closed[:, 2:] >= 0).all()
+    assert ((closed[:, 2] + closed[:, 3]) % 2 == 1).all()  # neighbours run along their edge in opposite directions
 
 
 def bad_triangles(kind: str, light_m: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:

@@ -36,7 +36,7 @@ def samples_beyond(kind: str, vertices: np.ndarray, light: np.ndarray, rng: np.r
 
 def covers(vertex_m, triangles, sample_m, fault):
     """In how many volumes each sample lies, by the test of the algorithms, or by a faulty one."""
-    planes, safe = edge_planes(vertex_m, triangles, vertex_m, False, jnp.float64(0), jnp.bool_(False))
+    planes, inward = edge_planes(vertex_m, triangles, vertex_m, False, jnp.float64(0), jnp.bool_(False))
     if fault == "float32":
         planes = jax.tree.map(lambda c: c.astype(jnp.float32) if c.dtype == jnp.float64 else c, planes)
         sample_m = tuple(c.astype(jnp.float32) for c in sample_m)
@@ -51,7 +51,7 @@ def covers(vertex_m, triangles, sample_m, fault):
         return total + inside(plane, sample_m, jnp.float64(0)).astype(jnp.int32), None
 
     total, _ = jax.lax.scan(one, jnp.zeros(sample_m[0].shape, jnp.int32), jnp.arange(triangles.shape[0]))
-    return total, safe
+    return total, inward != 0
 
 
 covers_jit = jax.jit(covers, static_argnums=3)

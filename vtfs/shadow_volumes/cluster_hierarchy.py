@@ -21,6 +21,6 @@ def cluster_hierarchy(frame: ShadowFrame, plan: ShadowPlan) -> ShadowMask:
     walked = walk_volumes(volume, table, samples, clusters.tile, False, plan)
     in_tile = jnp.sum(samples.receives, axis=1, dtype=jnp.int32)[clusters.tile]
     return mask_of(
-        walked, volume, samples, clusters.of_sample, in_tile, clusters.n_samples, clusters.n_clusters,
+        walked, volume.safe, samples, clusters.of_sample, in_tile, clusters.n_samples, clusters.n_clusters,
         clusters.n_blocks, clusters.n_blocks > plan.clusters,
     )  # fmt: skip

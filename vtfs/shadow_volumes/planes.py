@@ -1,11 +1,12 @@
 """The planes of a triangle's shadow volume: exact ones for samples, padded ones for nodes.
 
-The volume of triangle ABC and light L lies behind the triangle's plane and inside the three planes through L and an edge
-(Sintorn et al. 2011, Sec. 3). Coordinates are relative to the light, in view space; for a directional light to the eye.
+The volume of triangle ABC and light L lies behind the triangle's plane and inside the three planes through L and an
+edge (Sintorn et al. 2011, Sec. 3). Coordinates are relative to the light, in view space; for a directional light to
+the eye.
 
-**Samples** are tested in float64. An edge's normal is made from its vertices in index order, so that both triangles of the
-edge get the same numbers, negated; a sample exactly in the plane counts as moved by an infinitesimal step that is the
-same for every triangle. So a closed mesh is watertight, and each sample lies in exactly one of two neighbours.
+**Samples** are tested in float64. An edge's normal is made from its vertices in index order, so that both triangles of
+the edge get the same numbers, negated; a sample exactly in the plane counts as moved by an infinitesimal step that is
+the same for every triangle. So a closed mesh is watertight, and each sample lies in exactly one of two neighbours.
 
 **Nodes** are tested in float32 with unit normals. Their boxes are padded by what rounding may do: a node is rejected or
 accepted only where every sample in it would be.
@@ -23,14 +24,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 Extra = Literal["off", "vertex", "silhouette"]
-"""Three more planes, for rejection only: through each vertex and the light with the mean direction of the two side planes
-that meet there (Sintorn et al. 2014, Sec. 3), or those of them that also hold the eye and bound the volume on the screen
-(the silhouette edges of Sintorn et al. 2011, Sec. 4.2)."""
+"""Three more planes, for rejection only: through each vertex and the light with the mean direction of the two side
+planes that meet there (Sintorn et al. 2014, Sec. 3), or those of them that also hold the eye and bound the volume on
+the screen (the silhouette edges of Sintorn et al. 2011, Sec. 4.2)."""
 
 SMALLEST_VOLUME = 1e-10
 """A triangle is left out where its signed volume with the light is below this share of the product of edge normals and
-vertices that it is summed from: it is seen edge-on, or narrower than 1e-10 rad. Rounding (2^-52) then moves the border of
-what is kept by at most 1e-5 of its size, and its orientation is certain."""
+vertices that it is summed from: it is seen edge-on, or narrower than 1e-10 rad. Rounding (2^-52) then moves the border
+of what is kept by at most 1e-5 of its size, and its orientation is certain."""
 
 BELOW_ZERO = -1e-300
 """Below zero, above every product that is not zero, and no subnormal, which some devices take for zero."""
@@ -48,9 +49,11 @@ class EdgePlanes(eqx.Module):
     - `normal`: inward normals of the planes opposite vertex A, B and C, three components each; zero where the triangle
       casts nothing. Their dot products with a sample, divided by their sum, are barycentric coordinates.
     - `offset`: of these planes; zero for a point light.
-    - `least`: a sample is inside of a plane where its product is above this: 0, or just below it where the tie-break says
+    - `least`: a sample is inside of a plane where its product is above this: 0, or just below it where the tie-break
+      says
       that a sample in the plane is inside.
-    - `face`: normal of the triangle's plane, pointing away from a directional light; empty for a point light, where the sum
+    - `face`: normal of the triangle's plane, pointing away from a directional light; empty for a point light, where
+      the sum
       of the three dot products stands for it.
     - `behind`: a sample is behind the plane where the face's product is above this.
     """
@@ -88,17 +91,17 @@ def minus(a: Vector, b: Vector) -> Vector:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-def _corners(vertex_m: Vector, triangles: Int[Array, "n 3"]) -> tuple[Vector, Vector, Vector]:
+def corners(vertex_m: Vector, triangles: Int[Array, "n 3"]) -> tuple[Vector, Vector, Vector]:
     """Vertices A, B and C of each triangle: one gather."""
-    corners = jnp.stack(vertex_m)[:, triangles]
-    return tuple(tuple(corners[c, :, k] for c in range(3)) for k in range(3))  # type: ignore[return-value]
+    gathered = jnp.stack(vertex_m)[:, triangles]
+    return tuple(tuple(gathered[c, :, k] for c in range(3)) for k in range(3))  # type: ignore[return-value]
 
 
-def _times(a: Vector, s: Float[Array, "*n"]) -> Vector:
+def times(a: Vector, s: Float[Array, "*n"]) -> Vector:
     return a[0] * s, a[1] * s, a[2] * s
 
 
-def _length(a: Vector) -> Float[Array, "*n"]:
+def length(a: Vector) -> Float[Array, "*n"]:
     return jnp.sqrt(dot(a, a))
 
 
@@ -113,18 +116,21 @@ def edge_planes(
     directional: bool,
     bias_m: Float[Array, ""],
     culls_front: Bool[Array, ""],
-) -> tuple[EdgePlanes, Bool[Array, " n"]]:
+) -> tuple[EdgePlanes, Float[Array, " n"]]:
     """Exact planes of all volumes.
 
     **Arguments:**
 
-    - `vertex_m`: float64, relative to the light (directional: to the eye), in view space; `light_m`: a directional light's
+    - `vertex_m`: float64, relative to the light (directional: to the eye), in view space; `light_m`: a directional
+      light's
       unit direction, else unused.
     - `culls_front`: leave out triangles that face the light.
 
-    **Returns:** the planes, and which triangles have a volume: not edge-on, without area or of unsafe orientation.
+    **Returns:** the planes, and the orientation of each triangle: -1 where its front (counter-clockwise) faces the
+    light, 1
+    where it turns away, 0 where it has no volume: edge-on, without area, or of uncertain orientation.
     """
-    corner = _corners(vertex_m, triangles)
+    corner = corners(vertex_m, triangles)
     index = tuple(triangles[:, k] for k in range(3))
     normals, offsets = [], []
     for k in range(3):
@@ -133,11 +139,11 @@ def edge_planes(
         low, high = _pick(in_order, corner[first], corner[second]), _pick(in_order, corner[second], corner[first])
         normal = cross(light_m, minus(low, high)) if directional else cross(low, high)
         sign = jnp.where(in_order, 1.0, -1.0)
-        normals.append(_times(normal, sign))
+        normals.append(times(normal, sign))
         offsets.append(dot(normal, low) * sign if directional else None)
     face = cross(minus(corner[1], corner[0]), minus(corner[2], corner[0]))
     volume = -dot(face, light_m) if directional else dot(face, corner[0])
-    bound = sum(_length(normals[k]) * _length(corner[k]) for k in range(3))
+    bound = sum(length(normals[k]) * length(corner[k]) for k in range(3))
     safe = (jnp.abs(volume) > SMALLEST_VOLUME * bound) & jnp.isfinite(bound)
     # Counter-clockwise as seen from the light: it sees the front.
     safe = safe & ~(culls_front & (volume < 0))
@@ -146,16 +152,16 @@ def edge_planes(
     def last(values, absent: float = 0.0):
         return jnp.concatenate([values, jnp.full(1, absent, values.dtype)])
 
-    normals = [_times(normal, inward) for normal in normals]
-    least = [jnp.where(_first_is_positive(normal), BELOW_ZERO, 0.0) for normal in normals]
+    normals = [times(normal, inward) for normal in normals]
+    least = [jnp.where(first_is_positive(normal), BELOW_ZERO, 0.0) for normal in normals]
     planes = EdgePlanes(
         tuple(tuple(map(last, normal)) for normal in normals),
         tuple(last(offset * inward) for offset in offsets) if directional else (),
         tuple(last(value) for value in least),
-        tuple(last(c) for c in _times(face, inward)) if directional else (),
+        tuple(last(c) for c in times(face, inward)) if directional else (),
         last((dot(face, corner[0]) + bias_m * volume if directional else volume) * inward, jnp.inf),
     )
-    return planes, safe
+    return planes, inward
 
 
 def inside(planes: EdgePlanes, sample: Vector, moved: Float[Array, "*n"]) -> Bool[Array, "*n"]:
@@ -166,14 +172,14 @@ def inside(planes: EdgePlanes, sample: Vector, moved: Float[Array, "*n"]) -> Boo
     - `sample`: float64, relative to the light. NaN lies in no volume.
     - `moved`: bias over the distance to a point light; a directional light's is part of the planes.
     """
-    distances, holds = [], None
+    distances, holds = [], jnp.bool_(True)
     for k, normal in enumerate(planes.normal):
         distance = dot(normal, sample)
         if planes.offset:
             distance = distance - planes.offset[k]
         within = distance > planes.least[k]
         distances.append(distance)
-        holds = within if holds is None else holds & within
+        holds = holds & within
     if planes.face:
         return holds & (dot(planes.face, sample) > planes.behind)
     # A sample moved along its line to the light stays on its side of the edges.
@@ -182,7 +188,7 @@ def inside(planes: EdgePlanes, sample: Vector, moved: Float[Array, "*n"]) -> Boo
 
 def node_planes(
     planes: EdgePlanes,
-    safe: Bool[Array, " n"],
+    inward: Float[Array, " n"],
     vertex_m: Vector,
     triangles: Int[Array, "n 3"],
     light_m: Vector,
@@ -198,11 +204,11 @@ def node_planes(
     - `about_light`: nodes are given relative to the light: side planes hold the origin. Otherwise relative to the eye.
     """
 
-    units = [_unit(normal) for normal in planes.normal]
-    corner = _corners(vertex_m, jnp.concatenate([triangles, jnp.zeros((1, 3), triangles.dtype)]))
-    face = _unit(cross(minus(corner[1], corner[0]), minus(corner[2], corner[0])))
+    units = [unit(normal) for normal in planes.normal]
+    corner = corners(vertex_m, jnp.concatenate([triangles, jnp.zeros((1, 3), triangles.dtype)]))
+    face = unit(cross(minus(corner[1], corner[0]), minus(corner[2], corner[0])))
     away = -dot(face, light_m) if directional else dot(face, corner[0])
-    face = _times(face, jnp.where(away < 0, -1.0, 1.0))
+    face = times(face, jnp.where(away < 0, -1.0, 1.0))
     scale = (dot(face, corner[0]) + dot(face, corner[1]) + dot(face, corner[2])) / 3
     offsets = [scale]
     extras: list[Vector] = []
@@ -210,13 +216,13 @@ def node_planes(
         for k in range(3):
             a, b = units[(k + 1) % 3], units[(k + 2) % 3]
             total = (a[0] + b[0], a[1] + b[1], a[2] + b[2])
-            extras.append(_pick(_length(total) > 1e-6, _unit(total), _times(total, jnp.zeros_like(scale))))
+            extras.append(_pick(length(total) > 1e-6, unit(total), times(total, jnp.zeros_like(scale))))
     elif extra == "silhouette":
         seen = corner if directional else tuple(tuple(c + o for c, o in zip(v, light_m, strict=True)) for v in corner)
         extras = [_silhouette(light_m, seen, k) for k in range(3)]
     if not about_light:
         if directional:
-            sides = [_over_length(offset, normal) for offset, normal in zip(planes.offset, planes.normal, strict=True)]
+            sides = [_overlength(offset, normal) for offset, normal in zip(planes.offset, planes.normal, strict=True)]
             more = [dot(normal, corner[k]) for k, normal in enumerate(extras)] if extra == "vertex" else None
         else:
             sides = [dot(unit, light_m) for unit in units]
@@ -224,7 +230,7 @@ def node_planes(
             more = [dot(normal, light_m) for normal in extras] if extra == "vertex" else None
         more = [jnp.zeros_like(scale) for _ in extras] if more is None else more
         offsets = [*sides, *offsets, *more]
-    keeps = jnp.concatenate([safe, jnp.zeros(1, bool)])
+    keeps = jnp.concatenate([inward != 0, jnp.zeros(1, bool)])
     at = 0 if about_light else 3
     offsets[at] = jnp.where(keeps, offsets[at], jnp.inf)
 
@@ -239,31 +245,31 @@ def node_planes(
     )
 
 
-def _unit(v: Vector) -> Vector:
-    length = _length(v)
-    return _times(v, jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0))
+def unit(v: Vector) -> Vector:
+    size = length(v)
+    return times(v, jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 0.0))
 
 
-def _first_is_positive(v: Vector) -> Bool[Array, " n"]:
+def first_is_positive(v: Vector) -> Bool[Array, " n"]:
     """Is the first component that is not zero positive? On that side a sample in the plane is moved."""
     return (v[0] > 0) | ((v[0] == 0) & ((v[1] > 0) | ((v[1] == 0) & (v[2] > 0))))
 
 
-def _over_length(value: Float[Array, " n"], v: Vector) -> Float[Array, " n"]:
-    length = _length(v)
-    return jnp.where(length > 0, value / jnp.where(length > 0, length, 1.0), 0.0)
+def _overlength(value: Float[Array, " n"], v: Vector) -> Float[Array, " n"]:
+    size = length(v)
+    return jnp.where(size > 0, value / jnp.where(size > 0, size, 1.0), 0.0)
 
 
 def _silhouette(light_m: Vector, seen: tuple[Vector, ...], k: int) -> Vector:
     """The plane through eye, light and vertex `k`, if both other vertices lie on one side of it; else zero."""
     shape = seen[k][0].shape
     light = tuple(jnp.broadcast_to(c, shape) for c in light_m)
-    normal = _unit(cross(light, seen[k]))  # type: ignore[arg-type]
-    a, b = (dot(normal, seen[j]) / jnp.maximum(_length(seen[j]), 1e-300) for j in ((k + 1) % 3, (k + 2) % 3))
+    normal = unit(cross(light, seen[k]))  # type: ignore[arg-type]
+    a, b = (dot(normal, seen[j]) / jnp.maximum(length(seen[j]), 1e-300) for j in ((k + 1) % 3, (k + 2) % 3))
     least, most = jnp.minimum(a, b), jnp.maximum(a, b)
     # Certain signs only: 1e-9 is far above the rounding of float64, and far below a pixel.
     positive, negative = (least > -1e-14) & (most > 1e-9), (most < 1e-14) & (least < -1e-9)
-    return _times(normal, jnp.where(positive, 1.0, jnp.where(negative, -1.0, 0.0)))
+    return times(normal, jnp.where(positive, 1.0, jnp.where(negative, -1.0, 0.0)))
 
 
 Range = tuple[Float[Array, "*n"], Float[Array, "*n"]]
@@ -282,7 +288,8 @@ def box_range(normal: Vector, offset: Float[Array, "*n"] | None, box: tuple[Arra
 def frustum_range(normal: Vector, offset: Float[Array, "*n"] | None, part: tuple[Array, ...]) -> Range:
     """The same for a part of the view: a rectangle of slopes x / depth and y / depth between two depths.
 
-    This is the box in normalised device coordinates of Sintorn et al. 2011, which is linear in a plane. `part`: centre of
+    This is the box in normalised device coordinates of Sintorn et al. 2011, which is linear in a plane. `part`: centre
+    of
     both slopes and least depth, padded half extents of both slopes and greatest depth.
     """
     middle = normal[0] * part[0] + normal[1] * part[1] - normal[2]
@@ -298,7 +305,8 @@ def frustum_range(normal: Vector, offset: Float[Array, "*n"] | None, part: tuple
 def test_nodes(planes: NodePlanes, node: tuple[Array, ...], is_frustum: bool, bias_m) -> tuple[Array, Array, Array]:
     """Reject, accept or refine nodes against volumes; shapes broadcast.
 
-    **Returns:** whether a node is neither rejected by the four planes nor accepted, whether the extra planes keep it, and
+    **Returns:** whether a node is neither rejected by the four planes nor accepted, whether the extra planes keep it,
+    and
     whether it is accepted: every sample in it lies in the volume.
     """
     distance_range = frustum_range if is_frustum else box_range

@@ -27,4 +27,4 @@ def ptsv(frame: ShadowFrame, plan: ShadowPlan) -> ShadowMask:
     walked = walk_volumes(volume, table, samples, tiles, True, plan)
     item_of_sample = jnp.broadcast_to(jnp.asarray(place_of)[:, None], samples.receives.shape)
     n_items = jnp.sum(in_item > 0, dtype=jnp.int32)
-    return mask_of(walked, volume, samples, item_of_sample, in_item, in_item, n_items, jnp.int32(0), False)
+    return mask_of(walked, volume.safe, samples, item_of_sample, in_item, in_item, n_items, jnp.int32(0), False)

@@ -153,7 +153,8 @@ class SampleClusters(eqx.Module):
     - `tile`: of each cluster; `box`: empty boxes beyond `n_clusters`.
     - `of_sample`: cluster of each sample; meaningless where it receives nothing.
     - `n_samples`: of each cluster.
-    - `n_blocks`: parts of rows of 32 samples that lie in one cluster. Where they are more than the capacity, the rest is
+    - `n_blocks`: parts of rows of 32 samples that lie in one cluster. Where they are more than the capacity, the rest
+      is
       meaningless.
     """
 

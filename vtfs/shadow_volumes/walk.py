@@ -17,6 +17,7 @@ from vtfs.shadow_volumes.planes import (
     EdgePlanes,
     NodePlanes,
     PlaneTable,
+    Vector,
     edge_planes,
     inside,
     node_planes,
@@ -49,6 +50,13 @@ class Volumes(eqx.Module):
     bias_m: Float[Array, ""]
 
 
+def rotated(frame: ShadowFrame, v: Vector) -> Vector:
+    """World axes to those of view space."""
+    return tuple(
+        frame.rotation[k, 0] * v[0] + frame.rotation[k, 1] * v[1] + frame.rotation[k, 2] * v[2] for k in range(3)
+    )
+
+
 def volumes(frame: ShadowFrame, plan: ShadowPlan, about_light: bool) -> Volumes:
     """Planes of all triangles.
 
@@ -60,16 +68,13 @@ def volumes(frame: ShadowFrame, plan: ShadowPlan, about_light: bool) -> Volumes:
     origin = frame.eye_m if frame.directional else frame.light_m
     toward = frame.light_m if frame.directional else frame.light_m - frame.eye_m
 
-    def rotated(x, y, z):
-        return tuple(frame.rotation[k, 0] * x + frame.rotation[k, 1] * y + frame.rotation[k, 2] * z for k in range(3))
-
     # Relative first, then turned: a scene far from its origin loses nothing.
-    vertex = rotated(*(c - origin[k] for k, c in enumerate(frame.vertex_m)))
-    light = rotated(*toward)
-    edges, safe = edge_planes(vertex, frame.triangles, light, frame.directional, frame.bias_m, frame.culls_front)
-    nodes = node_planes(edges, safe, vertex, frame.triangles, light, frame.directional, plan.extra, about_light)
+    vertex = rotated(frame, tuple(c - origin[k] for k, c in enumerate(frame.vertex_m)))
+    light = rotated(frame, tuple(toward))
+    edges, inward = edge_planes(vertex, frame.triangles, light, frame.directional, frame.bias_m, frame.culls_front)
+    nodes = node_planes(edges, inward, vertex, frame.triangles, light, frame.directional, plan.extra, about_light)
     return Volumes(
-        plane_table(edges), plane_table(nodes), safe, tuple(zero) if frame.directional else light, frame.bias_m
+        plane_table(edges), plane_table(nodes), inward != 0, tuple(zero) if frame.directional else light, frame.bias_m
     )
 
 
@@ -157,7 +162,7 @@ def walk_volumes(
         lists = NodeLists(
             jnp.where(lists.triangle == batch, n_triangles, lists.triangle + first), lists.start, lists.count
         )
-        leaves, shadowed, counted = _to_leaves(lists, before, volume, table, is_frustum, plan, n_triangles)
+        leaves, shadowed, _, counted = _to_leaves(lists, before, volume, table, is_frustum, plan, n_triangles)
         hits = _test_samples(leaves, volume.edges, sample_rows, tile_of_item, volume.origin_m, plan)
         return shadowed, bits | hits, leaves, counted
 
@@ -215,10 +220,12 @@ def _to_leaves(
     is_frustum: bool,
     plan: ShadowPlan,
     absent: int,
-) -> tuple[NodeLists, Bool[Array, " nodes"], Counted]:
+) -> tuple[NodeLists, Bool[Array, " nodes"], Int[Array, " items"], Counted]:
     """From the list of the root to those of the items, level by level.
 
-    **Returns:** the items' lists, which nodes below the root lie in shadow as a whole, and the counts.
+    **Returns:** the items' lists, which nodes below the root lie in shadow as a whole, how many triangles accept each
+    item
+    or a node above it, and the counts.
     """
     b, levels = plan.branching, table.level_nodes
     first_row = np.cumsum([0, *levels[:-1]]).astype(np.int32)
@@ -265,7 +272,7 @@ def _to_leaves(
         )
 
     shadowed = before
-    parent = jnp.zeros(1, bool)
+    parent, cover = jnp.zeros(1, bool), jnp.zeros(1, jnp.int32)
     counts: list[tuple[Array, ...]] = []
     if plan.level_groups or len(levels) == 1:
         for level, nodes in enumerate(levels):
@@ -279,7 +286,8 @@ def _to_leaves(
             chunk = capacity + lists.triangle.shape[0] if plan.level_groups else chunk_groups
             done = step(lists, parent, was, level, n_children, lanes, capacity, chunk)
             counts.append(counted(lists, level, done))
-            parent = (jnp.repeat(parent, b, total_repeat_length=n_children) | done.accepted | was)[:kept]
+            parent = (jnp.repeat(parent, b, total_repeat_length=n_children) | (done.accepts > 0) | was)[:kept]
+            cover = (jnp.repeat(cover, b, total_repeat_length=n_children) + done.accepts)[:kept]
             shadowed = shadowed.at[at : at + kept].set(parent)
             lists = NodeLists(done.lists.triangle, done.lists.start[: kept + 1], done.lists.count[:kept])
         totals = [jnp.stack(column) for column in zip(*counts, strict=True)]
@@ -293,14 +301,14 @@ def _to_leaves(
             jnp.concatenate([lists.start, jnp.broadcast_to(lists.start[-1], n_leaf - 1)]),
             jnp.pad(lists.count, (0, n_leaf - 1)),
         )
-        parent = jnp.zeros(n_leaf, bool)
+        parent, cover = jnp.zeros(n_leaf, bool), jnp.zeros(n_leaf, jnp.int32)
         n_inner = len(levels) - 1
         offsets = jnp.asarray(first_child)
         widths = jnp.asarray(np.array(levels[1:], np.int32))
         place = jnp.arange(n_leaf, dtype=jnp.int32)
 
         def inner(level, state):
-            lists, parent, shadowed, counts = state
+            lists, parent, cover, shadowed, counts = state
             parents = NodeLists(lists.triangle, lists.start[: n_parents + 1], lists.count[:n_parents])
             n_children = n_parents * b
             own = place < widths[level]
@@ -308,28 +316,31 @@ def _to_leaves(
             was = shadowed[index] & own
             was_all = jnp.pad(was, (0, max(0, n_children - n_leaf)))[:n_children]
             done = step(parents, parent[:n_parents], was_all, level, n_children, LANES, groups, chunk_groups)
-            now = jnp.repeat(parent[:n_parents], b, total_repeat_length=n_children) | done.accepted
+            now = jnp.repeat(parent[:n_parents], b, total_repeat_length=n_children) | (done.accepts > 0)
+            cover = jnp.repeat(cover[:n_parents], b, total_repeat_length=n_children) + done.accepts
             now = (now[:n_leaf] | was) & own
             shadowed = shadowed.at[jnp.where(own, index, shadowed.shape[0])].set(now, mode="drop")
             values = counted(parents, level, done)
             counts = tuple(column.at[level].set(value) for column, value in zip(counts, values, strict=True))
             lists = NodeLists(done.lists.triangle, done.lists.start[: n_leaf + 1], done.lists.count[:n_leaf])
-            return lists, now, shadowed, counts
+            return lists, now, cover[:n_leaf], shadowed, counts
 
         zeros = jnp.zeros(len(levels), jnp.int64)
         columns = (zeros, zeros, zeros, zeros, jnp.zeros(len(levels), jnp.int32))
-        lists, parent, shadowed, columns = jax.lax.fori_loop(0, n_inner, inner, (lists, parent, shadowed, columns))
+        state = (lists, parent, cover, shadowed, columns)
+        lists, parent, cover, shadowed, columns = jax.lax.fori_loop(0, n_inner, inner, state)
         at, n_children = int(first_child[n_inner]), n_leaf * b
         was = shadowed[at : at + n_children]
         done = step(lists, parent, was, n_inner, n_children, LEAF_LANES, plan.leaf_groups, chunk_groups)
-        now = jnp.repeat(parent, b, total_repeat_length=n_children) | done.accepted | was
+        now = jnp.repeat(parent, b, total_repeat_length=n_children) | (done.accepts > 0) | was
+        cover = jnp.repeat(cover, b, total_repeat_length=n_children) + done.accepts
         shadowed = shadowed.at[at : at + n_children].set(now)
         values = counted(lists, n_inner, done)
         totals = [column.at[n_inner].set(value) for column, value in zip(columns, values, strict=True)]
         lists = done.lists
     node_tests, accepted, refined, extra, groups_needed = totals
     groups_needed = jnp.concatenate([groups_needed, lists.n_groups[None]])
-    return lists, shadowed, (node_tests, accepted, refined, extra, groups_needed)
+    return lists, shadowed, cover, (node_tests, accepted, refined, extra, groups_needed)
 
 
 def _sample_rows(samples: SampleTiles, volume: Volumes) -> Float[Array, "tiles 4 lanes"]:
@@ -390,6 +401,49 @@ def _test_samples(
     return _merged(bits, lists.start, tile_of_item.shape[0])
 
 
+def count_volumes(
+    volume: Volumes,
+    table: NodeTable,
+    samples: SampleTiles,
+    tile_of_item: Int[Array, " items"],
+    plan: ShadowPlan,
+) -> tuple[Int[Array, "items lanes"], Walk]:
+    """In how many volumes each sample of the items' tiles lies; the walk's own bits are empty."""
+    n_triangles, n_items = volume.safe.shape[0], tile_of_item.shape[0]
+    before = jnp.zeros(sum(table.level_nodes[1:]) + table.level_nodes[-1] * plan.branching, bool)
+    root = one_list(volume.safe, LANES, n_triangles)
+    leaves, _, cover, counted = _to_leaves(root, before, volume, table, False, plan, n_triangles)
+    node_tests, accepted, refined, extra, groups = counted
+    capacity, lanes = leaves.triangle.shape
+    n_samples = samples.z_m.shape[1]
+    chunk = max(1, _SAMPLES_AT_ONCE.get(jax.default_backend(), 2**24) // (lanes * n_samples))
+    n_padded = -(-capacity // chunk) * chunk
+    triangle = jnp.pad(leaves.triangle, ((0, n_padded - capacity), (0, 0)), constant_values=n_triangles)
+    n_groups = jnp.minimum(leaves.n_groups, capacity)
+    item_of_group = jnp.minimum(last_not_above(leaves.start, jnp.arange(n_padded, dtype=jnp.int32)), n_items - 1)
+    rows = jnp.stack([samples.x_m, samples.y_m, samples.z_m], axis=1)
+
+    def loop(state):
+        first, total = state
+        group = first + jnp.arange(chunk, dtype=jnp.int32)
+        item = jax.lax.dynamic_slice_in_dim(item_of_group, first, chunk)
+        row = rows[tile_of_item[item]]
+        position = tuple(row[:, c].astype(jnp.float64) for c in range(3))
+        planes = volume.edges.at(jax.lax.dynamic_slice_in_dim(triangle, first, chunk))
+        held = jnp.zeros((chunk, n_samples), jnp.int32)
+        for lane in range(lanes):
+            one = jax.tree.map(lambda c, lane=lane: c[:, lane : lane + 1], planes)
+            held = held + inside(one, position, jnp.float64(0)).astype(jnp.int32)
+        item = jnp.where(group < n_groups, item, n_items)
+        return first + chunk, total.at[item].add(held, mode="drop")
+
+    total = jnp.broadcast_to(cover[:n_items, None], (n_items, n_samples))
+    _, total = jax.lax.while_loop(lambda state: state[0] < n_groups, loop, (jnp.int32(0), total))
+    overflowed = leaves.overflowed | _too_many(groups[:-1], plan)
+    none = jnp.zeros((n_items, max(1, n_samples // 32)), jnp.uint32)
+    return total, Walk(none, node_tests, accepted, refined, extra, groups, leaves.count[:n_items], overflowed)
+
+
 def _merged(
     bits: UInt32[Array, "groups words"], start: Int[Array, " items_and_1"], n_items: int
 ) -> UInt32[Array, "items words"]:
@@ -417,7 +471,7 @@ def _merged(
 
 def mask_of(
     walked: Walk,
-    volume: Volumes,
+    casts: Bool[Array, " triangles"],
     samples: SampleTiles,
     item_of_sample: Int[Array, "tiles lanes"],
     n_in_tile: Int[Array, " items"],
@@ -448,11 +502,12 @@ def mask_of(
         walked.extra,
         jnp.sum(length * n_in_tile),
         jnp.sum(length * n_in_item),
+        jnp.int64(-1),
         walked.groups,
         walked.list_length,
         n_items,
         n_blocks,
-        jnp.sum(volume.safe, dtype=jnp.int32),
+        jnp.sum(casts, dtype=jnp.int32),
     )
     view = samples.viewport, samples.tile_px
     return ShadowMask(in_runs(shadowed, *view), walked.overflowed | overflowed, in_runs(tests, *view), counts)
