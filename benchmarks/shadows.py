@@ -166,14 +166,14 @@ def main() -> None:
     print(f"{case.name}, {device_name()}: {rays['rays']:,} samples, {by_rays.mean():.1%} in shadow", flush=True)
     print(f"embree robust: build {rays['build_ms']:.1f} ms, rays {rays['query_ms']:.1f} ms")
     print(
-        f"{'technique':<18}{'tile':>5}{'b':>4}  {'variant':<28}{'ms':>9}{'M tests':>9}{'M node':>8}{'errors':>7}{'bands':>6}"
+        f"{'technique':<18}{'tile':>5}{'b':>4}  {'variant':<28}{'ms':>9}{'M tests':>9}{'M node':>8}"
+        f"{'errors':>7}{'bands':>6}"
     )
     out = arguments.out / f"shadows-{case.name.split(' (')[0].replace(' ', '-')}.json"
     longest_s = 0.0
     for technique, plan in variants(arguments.variants):
-        label = (
-            f"{plan.bounds if technique != 'ptsv' else 'depths'} {plan.extra} {'' if plan.feedback else 'no feedback'}"
-        )
+        bounds = "depths" if technique == "ptsv" else plan.bounds
+        label = f"{bounds} {plan.extra} {'' if plan.feedback else 'no feedback'}"
         head = f"{technique:<18}{plan.tile_px:>5}{plan.branching:>4}  {label:<28}"
         result: dict = {"technique": technique, "plan": asdict(plan)}
         started = time.monotonic()
