@@ -53,7 +53,7 @@ def soup(camera: Camera, rng: np.random.Generator) -> Casters:
     vertices = np.zeros((N_VERTICES, 3))
     vertices[: 4 * n_pairs] = corners.reshape(-1, 3)
     first = 4 * np.arange(n_pairs)[:, None]
-    triangles = np.concatenate([first + [0, 1, 2], first + [2, 1, 3]])
+    triangles = np.concatenate([first + np.array([0, 1, 2]), first + np.array([2, 1, 3])])
     return Casters(vertices + camera.eye_m, rng.permutation(triangles))
 
 
