@@ -1,0 +1,206 @@
+"""Shadow techniques against branching, tile size and Embree: time, tests and errors of every variant.
+
+python -m benchmarks.shadows --out DIR [--scene clumps|BUILT_IN|FILE] [--triangles 60000]
+    [--cameras FILE] [--frame 0] [--size 1024] [--minutes 8] [--variants cross|all|quick]
+
+One process. A configuration that fails, or for which no time is left, is a line of the table too. Each program runs
+from view samples to mask: clusters, hierarchy, planes, walk and merge; vertices, triangles and samples are on the
+device, nothing else is made before. Errors are samples outside the bands of `shadow_references.classify`, on at most
+2,000 samples drawn at random and on all that differ from Embree.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from benchmarks.shadow_cases import LIGHT, at_size, clumps_scene
+from vtfs.camera import load_cameras
+from vtfs.device import device_name, keep_compiled_programs, versions
+from vtfs.files import write_atomically
+from vtfs.gallery import GALLERY, build_scene
+from vtfs.gbuffer import from_runs
+from vtfs.scene import load_scene
+from vtfs.shadow_casters import Casters, ShadowLight, opaque_casters
+from vtfs.shadow_mask import ShadowPlan, casters_on_device, default_bias_m, facing_samples, shadow_frame
+from vtfs.shadow_references import ShadowRays, brute_force, classify, view_points_m
+from vtfs.shadow_techniques import fitted, run_program, shadow_counts, shadow_grid, shadow_program
+from vtfs.view_samples import ViewSamples, trace_view_samples
+
+N_CHECKED, N_CLASSIFIED = 2_000, 400
+BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (8, 16, 4, 32, 2)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One view of one scene with one light."""
+
+    name: str
+    samples: ViewSamples
+    casters: Casters
+    light: ShadowLight
+    receives: np.ndarray
+    bias_m: float
+
+
+def read_case(arguments: argparse.Namespace) -> Case:
+    if arguments.scene == "clumps":
+        scene, light = clumps_scene(arguments.triangles), LIGHT
+    elif arguments.scene in GALLERY:
+        scene, light = build_scene(arguments.scene, arguments.triangles), None
+    else:
+        scene, light = load_scene(Path(arguments.scene)), None
+    path = load_cameras(Path(arguments.cameras)) if arguments.cameras else scene.cameras
+    if path is None:
+        raise SystemExit(f"{arguments.scene}: has no cameras; give --cameras FILE.")
+    samples = trace_view_samples(scene, at_size(path.camera(arguments.frame), arguments.size))
+    if light is None:
+        low, high = scene.bounds_m
+        light = ShadowLight(tuple(low + (high - low) * np.array([0.45, 0.8, 0.55])))
+    casters = opaque_casters(scene)
+    # The case of the rays tests every valid sample; elsewhere those that face the light.
+    receives = samples.valid if arguments.scene == "clumps" else facing_samples(samples, light)
+    name = f"{scene.name} ({casters.n_triangles:,} triangles, {arguments.size} squared)"
+    return Case(name, samples, casters, light, receives, default_bias_m(casters))
+
+
+def variants(which: str) -> Iterator[tuple[str, ShadowPlan]]:
+    """The most telling first: what comes late may find no time left."""
+    yield "cluster_hierarchy", ShadowPlan(8, 8)
+    yield "ptsv", ShadowPlan(8, 8, extra="silhouette")
+    if which == "quick":
+        return
+    yield "cluster_hierarchy", ShadowPlan(8, 32)
+    yield "ptsv", ShadowPlan(8, 32, extra="silhouette")
+    yield "cluster_hierarchy", ShadowPlan(8, 8, extra="off")
+    yield "cluster_hierarchy", ShadowPlan(8, 8, feedback=False)
+    yield "cluster_hierarchy", ShadowPlan(8, 8, bounds="implicit")
+    crossed = [(8, b) for b in BRANCHINGS if b not in (8, 32)] + [(tile_px, 8) for tile_px in TILES if tile_px != 8]
+    rest = [(tile_px, b) for tile_px in TILES for b in BRANCHINGS if tile_px != 8 and b != 8]
+    for tile_px, branching in crossed + (rest if which == "all" else []):
+        yield "cluster_hierarchy", ShadowPlan(tile_px, branching)
+        yield "ptsv", ShadowPlan(tile_px, branching, extra="silhouette")
+
+
+def times_ms(run, seconds: float = 1.0, fewest: int = 5) -> list[float]:
+    times, end = [], time.perf_counter() + seconds
+    while len(times) < fewest or (time.perf_counter() < end and len(times) < 50):
+        started = time.perf_counter()
+        jax.block_until_ready(run())
+        times.append(1e3 * (time.perf_counter() - started))
+    return times
+
+
+def embree(case: Case) -> tuple[dict, np.ndarray]:
+    """Shadow rays of the same samples on all cores, build included, and their answers."""
+    points = view_points_m(case.samples, case.receives)
+    eye = np.array(case.samples.camera.eye_m)
+    started = time.perf_counter()
+    rays = ShadowRays(case.casters)
+    build_ms = 1e3 * (time.perf_counter() - started)
+    answers = rays.shadowed(points, case.light, case.bias_m, eye)
+    times = times_ms(lambda: rays.shadowed(points, case.light, case.bias_m, eye))
+    return {"build_ms": build_ms, "query_ms": float(np.median(times)), "rays": len(points)}, answers
+
+
+def measure(case: Case, technique: str, plan: ShadowPlan, by_rays: np.ndarray) -> dict:
+    """Time, counts and errors of one configuration."""
+    started = time.perf_counter()
+    grid = shadow_grid(case.samples, plan.tile_px)
+    casters = casters_on_device(case.casters)
+    frame = shadow_frame(case.samples, casters, case.light, grid, case.bias_m, case.receives)
+    plan = fitted(technique, plan, frame)
+    counted = run_program(technique, plan, frame)
+    with jax.enable_x64(True):
+        program = shadow_program(technique, plan)
+        shadowed, overflowed = jax.block_until_ready(program(frame))
+        prepared_s = time.perf_counter() - started
+        times = times_ms(lambda: program(frame))
+    assert not bool(overflowed)
+    mask = from_runs(np.asarray(shadowed), case.samples.camera.viewport)[case.receives]
+    points, eye = view_points_m(case.samples, case.receives), np.array(case.samples.camera.eye_m)
+    rng = np.random.default_rng(0)
+    some = np.sort(rng.choice(len(points), min(N_CHECKED, len(points)), replace=False))
+    differs = np.flatnonzero(mask != by_rays)
+    some = np.union1d(some, differs[:N_CLASSIFIED])
+    reference = brute_force(points[some], case.casters, case.light, case.bias_m, eye)
+    found = classify(points[some], mask[some] != reference, case.casters, case.light, case.bias_m, eye)
+    return {
+        "outcome": "timed",
+        "time_ms": float(np.median(times)),
+        "times_ms": times,
+        "prepared_s": prepared_s,
+        "differ_from_rays": len(differs),
+        "checked": len(some),
+        "near_edge": found.near_edge,
+        "near_plane": found.near_plane,
+        "errors": found.errors,
+        "counts": shadow_counts(counted, frame, plan),
+        "capacities": asdict(plan),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--scene", default="clumps")
+    parser.add_argument("--triangles", type=int, default=60_000)
+    parser.add_argument("--cameras")
+    parser.add_argument("--frame", type=int, default=0)
+    parser.add_argument("--size", type=int, default=1024)
+    parser.add_argument("--minutes", type=float, default=8.0)
+    parser.add_argument("--variants", choices=("cross", "all", "quick"), default="cross")
+    arguments = parser.parse_args()
+    end = time.monotonic() + 60 * arguments.minutes
+    keep_compiled_programs()
+    case = read_case(arguments)
+    rays, by_rays = embree(case)
+    record = {"scene": case.name, "device": device_name(), "versions": versions(), "embree": rays, "results": []}
+    print(f"{case.name}, {device_name()}: {rays['rays']:,} samples, {by_rays.mean():.1%} in shadow", flush=True)
+    print(f"embree robust: build {rays['build_ms']:.1f} ms, rays {rays['query_ms']:.1f} ms")
+    print(
+        f"{'technique':<18}{'tile':>5}{'b':>4}  {'variant':<28}{'ms':>9}{'M tests':>9}{'M node':>8}"
+        f"{'errors':>7}{'bands':>6}"
+    )
+    out = arguments.out / f"shadows-{case.name.split(' (')[0].replace(' ', '-')}.json"
+    longest_s = 0.0
+    for technique, plan in variants(arguments.variants):
+        bounds = "depths" if technique == "ptsv" else plan.bounds
+        label = f"{bounds} {plan.extra} {'' if plan.feedback else 'no feedback'}"
+        head = f"{technique:<18}{plan.tile_px:>5}{plan.branching:>4}  {label:<28}"
+        result: dict = {"technique": technique, "plan": asdict(plan)}
+        started = time.monotonic()
+        if started + longest_s > end:
+            result |= {"outcome": "no time left"}
+            print(f"{head}no time left", flush=True)
+        else:
+            try:
+                result |= measure(case, technique, plan, by_rays)
+                counts = result["counts"]
+                print(
+                    f"{head}{result['time_ms']:>9.2f}{counts['test_and_set'] / 1e6:>9.2f}"
+                    f"{counts['node_tests'] / 1e6:>8.2f}"
+                    f"{result['errors']:>7}{result['near_edge'] + result['near_plane']:>6}",
+                    flush=True,
+                )
+            except Exception as error:  # a configuration that fails is a result
+                result |= {
+                    "outcome": "failed",
+                    "error": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
+                }
+                print(f"{head}failed: {result['error'][:90]}", flush=True)
+            longest_s = max(longest_s, time.monotonic() - started)
+        record["results"].append(result)
+        write_atomically(out, json.dumps(record, indent=1).encode())
+    print(out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,328 @@
+"""Every shadow technique against brute force; one mask, whatever the variant; and what is counted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.strategies import SMALL, a_camera, seeds, surface_samples
+from vtfs.camera import Camera, Viewport, load_cameras
+from vtfs.gallery import build_scene
+from vtfs.input_error import InputError
+from vtfs.scene import load_scene
+from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, opaque_casters
+from vtfs.shadow_mask import (
+    ShadowPlan,
+    casters_on_device,
+    default_bias_m,
+    edge_list,
+    facing_samples,
+    shadow_frame,
+)
+from vtfs.shadow_references import ShadowRays, brute_force, classify, facing_light, kept_casters, view_points_m
+from vtfs.shadow_techniques import cast_shadows, fitted, on_host, run_program, shadow_grid, shadow_program
+from vtfs.view_samples import ViewSamples, trace_view_samples
+
+some = settings(max_examples=5, deadline=None)
+N_TRIANGLES, N_VERTICES = 200, 600
+CLUSTERS = ShadowPlan(8, 8, clusters=2**10, groups=2**10, leaf_groups=2**13)
+TILES = replace(CLUSTERS, branching=32, extra="silhouette")
+LIGHTS = ("at the eye", "near", "inside", "far")
+
+
+def light_of(camera: Camera, kind: str, rng: np.random.Generator) -> ShadowLight:
+    way = rng.normal(size=3)
+    if kind == "directional":
+        return ShadowLight(tuple(way * 10 ** rng.uniform(-5, 5)), directional=True)
+    distance = {"at the eye": 0.0, "near": 1e-3, "inside": 3.0, "far": 1e4}[kind]
+    return ShadowLight(tuple(np.array(camera.eye_m) + way * distance))
+
+
+def soup(camera: Camera, rng: np.random.Generator) -> Casters:
+    """Pairs of triangles that share an edge, of all sizes, around the camera: a fifth or so of the view in shadow."""
+    n_pairs = N_TRIANGLES // 2
+    size = 10 ** rng.uniform(-1.5, 0.4, (n_pairs, 1, 1))
+    corners = rng.normal(size=(n_pairs, 1, 3)) * 8 + rng.normal(size=(n_pairs, 4, 3)) * size
+    vertices = np.zeros((N_VERTICES, 3))
+    vertices[: 4 * n_pairs] = corners.reshape(-1, 3)
+    first = 4 * np.arange(n_pairs)[:, None]
+    triangles = np.concatenate([first + np.array([0, 1, 2]), first + np.array([2, 1, 3])])
+    return Casters(vertices + camera.eye_m, rng.permutation(triangles))
+
+
+def cast(
+    technique: str,
+    plan: ShadowPlan,
+    samples: ViewSamples,
+    casters: Casters,
+    light: ShadowLight,
+    bias_m: float,
+    front_faces: FrontFaces = "cast",
+    receives: np.ndarray | None = None,
+):
+    """Without a sizing run: the capacities of these tests hold everything, or the mask is refused."""
+    grid = shadow_grid(samples, plan.tile_px)
+    frame = shadow_frame(samples, casters_on_device(casters), light, grid, bias_m, receives, front_faces)
+    return on_host(run_program(technique, plan, frame), plan, frame)
+
+
+def assert_equal_outside_the_bands(mask, samples, casters, light, bias_m, most_in_bands, receives=None):
+    """Against brute force; with a receiver mask the others must be lit."""
+    receives = samples.valid if receives is None else receives
+    points = view_points_m(samples, receives)
+    eye = np.array(samples.camera.eye_m)
+    reference = brute_force(points, casters, light, bias_m, eye)
+    found = classify(points, mask[receives] != reference, casters, light, bias_m, eye)
+    assert found.errors == 0
+    assert found.total <= most_in_bands * len(points)
+    assert not mask[~receives].any()
+    return reference
+
+
+@pytest.mark.parametrize(("technique", "plan"), [("cluster_hierarchy", CLUSTERS), ("ptsv", TILES)])
+@given(seed=seeds, kind=st.sampled_from(LIGHTS), front_faces=st.sampled_from(["cast", "culled"]))
+@some
+def test_a_triangle_soup_shadows_what_brute_force_says(technique, plan, seed, kind, front_faces):
+    rng = np.random.default_rng(seed)
+    # Kilometres from the origin, as large worlds are.
+    camera = a_camera(SMALL, eye_m=((1.0, 2.0, 3.0), (1e6, -3e5, 1e6))[seed % 2])
+    samples, casters, light = surface_samples(camera, seed), soup(camera, rng), light_of(camera, kind, rng)
+    bias_m = default_bias_m(casters)
+    found = cast(technique, plan, samples, casters, light, bias_m, front_faces)
+    kept = kept_casters(casters, light, front_faces)
+    # Nothing lies on a caster, so the bands hold next to nothing: 5 of 561 samples by chance.
+    assert_equal_outside_the_bands(found.shadowed, samples, kept, light, bias_m, 0.01)
+    shuffled = Casters(casters.vertices_m, rng.permutation(casters.triangles))
+    assert (cast(technique, plan, samples, shuffled, light, bias_m, front_faces).shadowed == found.shadowed).all()
+
+
+def test_a_directional_light_shadows_what_brute_force_says():
+    plan = replace(CLUSTERS, extra="vertex")
+    camera = a_camera(SMALL, eye_m=(1e6, -3e5, 1e6))
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        samples, casters, light = surface_samples(camera, seed), soup(camera, rng), light_of(camera, "directional", rng)
+        bias_m = default_bias_m(casters)
+        mask = cast("cluster_hierarchy", plan, samples, casters, light, bias_m).shadowed
+        assert_equal_outside_the_bands(mask, samples, casters, light, bias_m, 0.01)
+
+
+def balls(camera: Camera, rng: np.random.Generator) -> Casters:
+    """Two closed balls and twenty loose triangles: always the same edges, as each number of them compiles."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    parts, triangles, n = [], [], 0
+    for _ in range(2):
+        parts.append(np.array(ball.vertices) * 10 ** rng.uniform(-0.5, 0.5) + rng.normal(size=3) * 6)
+        triangles.append(np.array(ball.faces) + n)
+        n += len(ball.vertices)
+    loose = rng.normal(size=(20, 1, 3)) * 6 + rng.normal(size=(20, 3, 3)) * 2
+    parts.append(loose.reshape(-1, 3))
+    triangles.append(n + np.arange(60).reshape(20, 3))
+    return Casters(np.concatenate(parts) + camera.eye_m, np.concatenate(triangles))
+
+
+@pytest.mark.parametrize("technique", ["z_pass", "z_fail"])
+def test_stencils_shadow_what_brute_force_says(technique):
+    n_shadowed = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        camera = a_camera(SMALL, eye_m=((1.0, 2.0, 3.0), (1e6, -3e5, 1e6))[seed % 2])
+        samples, casters = surface_samples(camera, seed), balls(camera, rng)
+        light = light_of(camera, ("inside", "far", "near")[seed % 3], rng)
+        bias_m = default_bias_m(casters)
+        receives = samples.valid.copy()
+        if technique == "z_pass":  # it has no caps: only what the eye sees is right
+            eye = ShadowLight(camera.eye_m)
+            points = view_points_m(samples, samples.valid)
+            receives[samples.valid] = ~brute_force(points, casters, eye, 0.0, np.array(camera.eye_m))
+        found = cast(technique, CLUSTERS, samples, casters, light, bias_m, receives=receives)
+        assert_equal_outside_the_bands(found.shadowed, samples, casters, light, bias_m, 0.02, receives)
+        n_shadowed += found.shadowed.sum()
+        assert found.counts["test_and_set"] >= found.shadowed.sum()
+    assert n_shadowed > 100
+
+
+def test_each_edge_is_listed_once_with_its_two_triangles():
+    #  0-1-2 and 0-2-3 share 0-2; 4 hangs on 0-2 too; 2, 2, 3 is no triangle
+    triangles = np.array([[0, 1, 2], [0, 2, 3], [2, 0, 4], [2, 2, 3]], np.int32)
+    edges = edge_list(triangles)
+    assert edges.dtype == np.int32
+    found = {tuple(edge) for edge in edges.tolist()}
+    assert {(0, 1, 0, -1), (1, 2, 0, -1), (0, 3, 3, -1), (0, 4, 4, -1), (2, 4, 5, -1), (2, 3, 2, 6)} < found
+    shared = sorted(edge for edge in found if edge[:2] == (0, 2))
+    assert [edge[2:] for edge in shared] in ([(1, 2), (5, -1)], [(1, 2), (4, -1)])
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    closed = edge_list(np.array(ball.faces, np.int32))
+    assert len(closed) == len(ball.edges_unique) and (closed[:, 2:] >= 0).all()
+    assert ((closed[:, 2] + closed[:, 3]) % 2 == 1).all()  # neighbours run along their edge in opposite directions
+
+
+def bad_triangles(kind: str, light_m: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Corners `[n, 3, 3]` of triangles before a light that no rasteriser likes."""
+    a, b = rng.normal(size=(2, n, 3)) * 5
+    t, u = rng.uniform(-2, 2, (2, n, 1))
+    if kind == "edge-on":  # the light lies in the plane, up to rounding
+        corners = np.stack([a, b, t * a + u * b], axis=1)
+    elif kind == "zero area":
+        corners = np.stack([a, b, a + t * (b - a)], axis=1)
+    elif kind == "repeated":
+        corners = np.stack([a, b, np.where(t > 0, a, b)], axis=1)
+    elif kind == "light at a vertex":
+        corners = np.stack([a, b, np.zeros((n, 3))], axis=1)
+    else:
+        corners = np.stack([a, b, rng.normal(size=(n, 3)) * 5], axis=1)
+        scale = {"tiny": 1e-30, "huge": 1e30}[kind]
+        corners = corners * scale + np.where(rng.random((n, 1, 1)) < 0.5, a[:, None], 0)
+    return corners + light_m
+
+
+def test_ten_thousand_bad_triangles_shadow_nothing_that_brute_force_leaves_lit():
+    camera = a_camera(SMALL)
+    samples = surface_samples(camera, 0)
+    points, eye = view_points_m(samples, samples.valid), np.array(camera.eye_m)
+    kinds = ("edge-on", "zero area", "repeated", "light at a vertex", "tiny", "huge")
+    order = np.arange(N_VERTICES, dtype=np.int32).reshape(-1, 3)
+    bias_m = 3e-4  # of the samples' extent: the casters' own is without meaning here
+    n_done = 0
+    for seed in range(9):
+        for kind in kinds:
+            rng = np.random.default_rng(seed)
+            light = light_of(camera, LIGHTS[seed % 3], rng)
+            corners = bad_triangles(kind, np.array(light.position_m), N_TRIANGLES, rng)
+            casters = Casters(corners.reshape(-1, 3), order)
+            mask = cast("cluster_hierarchy", CLUSTERS, samples, casters, light, bias_m).shadowed
+            reference = brute_force(points, casters, light, bias_m, eye)
+            found = classify(points, mask[samples.valid] & ~reference, casters, light, bias_m, eye)
+            assert found.errors == 0, (kind, seed)
+            n_done += N_TRIANGLES
+    assert n_done >= 10_000
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_casters_that_are_not_finite_are_refused_by_name(value):
+    corners = np.eye(3)
+    corners[1, 2] = value
+    with pytest.raises(InputError, match=r"casters `triangles`: triangle 0 .*NaN or infinite"):
+        Casters(corners, np.array([[0, 1, 2]]))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Casters(np.eye(3), np.array([[0, 1, 3]])), "index 3 is out of range"),
+        (lambda: ShadowLight((0.0, np.nan, 0.0)), "position_m"),
+        (lambda: ShadowLight((0.0, 0.0, 0.0), directional=True), "needs a direction"),
+    ],
+)
+def test_bad_input_is_refused_by_name(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_batches_and_feedback_change_tests_and_not_the_mask():
+    camera = a_camera(SMALL)
+    rng = np.random.default_rng(3)
+    samples, casters = surface_samples(camera, 3), soup(camera, rng)
+    light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
+    whole = cast("cluster_hierarchy", CLUSTERS, samples, casters, light, bias_m)
+    plain = replace(CLUSTERS, batch=64, feedback=False)
+    parts = cast("cluster_hierarchy", plain, samples, casters, light, bias_m)
+    assert (parts.shadowed == whole.shadowed).all() and 0 < whole.shadowed.sum() < samples.n_valid
+    assert whole.counts["test_and_set"] <= parts.counts["test_and_set"]
+    assert whole.counts["casters"] == parts.counts["casters"] <= N_TRIANGLES
+    for found in (whole, parts):
+        counts, levels = found.counts, range(sum(name.startswith("refined_") for name in found.counts))
+        # A sample's list is tested against each sample of its cluster.
+        assert found.tests.sum() == counts["test_and_set_in_cluster"] - counts["node_tests"]
+        assert counts["sample_tests"] >= found.tests.sum()
+        assert counts["node_tests"] == sum(counts[f"node_tests_{k}"] for k in levels)
+        for k in levels:
+            assert counts[f"accepted_{k}"] + counts[f"refined_{k}"] <= counts[f"node_tests_{k}"]
+            if k:
+                assert counts[f"node_tests_{k}"] <= 8 * max(counts[f"refined_{k - 1}"], counts["casters"])
+        assert counts["listed_pairs"] == counts[f"refined_{max(levels)}"]
+
+
+def test_what_does_not_fit_is_refused_and_run_again_not_cut():
+    camera = a_camera(SMALL)
+    rng = np.random.default_rng(3)
+    samples, casters = surface_samples(camera, 3), soup(camera, rng)
+    light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
+    whole = cast("cluster_hierarchy", CLUSTERS, samples, casters, light, bias_m)
+    with pytest.raises(InputError, match="no longer fits"):
+        cast("cluster_hierarchy", replace(CLUSTERS, leaf_groups=4), samples, casters, light, bias_m)
+    grid = shadow_grid(samples, 8)
+    frame = shadow_frame(samples, casters_on_device(casters), light, grid, bias_m)
+    plan = fitted("cluster_hierarchy", replace(CLUSTERS, leaf_groups=4), frame, unrolled=True)
+    assert plan.leaf_groups > 4 and plan.level_groups
+    with jax.enable_x64(True):
+        shadowed, overflowed = shadow_program("cluster_hierarchy", plan)(frame)
+    assert not bool(overflowed)
+    as_image = on_host(run_program("cluster_hierarchy", plan, frame), plan, frame)
+    assert (as_image.shadowed == whole.shadowed).all()
+    assert int(np.asarray(shadowed).sum()) == whole.shadowed.sum()
+
+
+def gallery_case(n_triangles: int, size_px: int):
+    scene = build_scene("atrium", n_triangles)
+    camera = replace(scene.cameras.camera(0), viewport=Viewport(size_px, size_px))  # type: ignore[union-attr]
+    low, high = scene.bounds_m
+    light = ShadowLight(tuple(low + (high - low) * np.array([0.4, 0.7, 0.45])))
+    return trace_view_samples(scene, camera), opaque_casters(scene), light
+
+
+def test_a_built_in_scene_in_16k_samples():
+    samples, casters, light = gallery_case(4_000, 128)
+    receives = facing_samples(samples, light)
+    found = cast_shadows("cluster_hierarchy", ShadowPlan(8, 8), samples, casters, light, receives=receives)
+    bias_m = default_bias_m(casters)
+    reference = assert_equal_outside_the_bands(found.shadowed, samples, casters, light, bias_m, 1e-3, receives)
+    assert 0.02 < reference.mean() < 0.98
+    # Embree is float32, and leaks at edges: it agrees but for a few samples.
+    rays = ShadowRays(casters).shadowed(view_points_m(samples, receives), light, bias_m, np.array(samples.camera.eye_m))
+    assert (rays != reference).sum() <= 1e-3 * len(rays)
+
+
+def test_mismatches_are_told_apart():
+    """A triangle one metre before the light: one point behind its middle, one on its edge, one on its plane."""
+    casters = Casters(np.array([[-1.0, -1, -1], [1, -1, -1], [0, 1, -1]]), np.array([[0, 1, 2]]))
+    light = ShadowLight((0.0, 0.0, 0.0))
+    points = np.array([[0.0, -0.2, -5.0], [2e-6, -2, -2], [0.0, -0.2, -1.0001], [30.0, 0, -1]])
+    found = classify(points, np.ones(4, bool), casters, light, bias_m=1e-4)
+    assert (found.near_edge, found.near_plane, found.errors) == (1, 1, 2)
+    assert found.error_points.tolist() == [0, 3] and found.total == 4
+    assert classify(points, np.zeros(4, bool), casters, light, 1e-4).total == 0
+    assert facing_light(casters, light).tolist() == [True]
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("frame", [0, 9])
+@pytest.mark.parametrize(
+    ("technique", "plan"),
+    [
+        ("cluster_hierarchy", ShadowPlan(8, 8)),
+        ("cluster_hierarchy", ShadowPlan(16, 4, bounds="implicit", extra="off", feedback=False)),
+        ("cluster_hierarchy", ShadowPlan(4, 32, batch=2**14)),
+        ("ptsv", ShadowPlan(8, 32, extra="silhouette")),
+        ("ptsv", ShadowPlan(5, 16, extra="off", feedback=False)),
+    ],
+    ids=str,
+)
+def test_every_variant_on_a_real_scene(technique, plan, frame):
+    scenes = Path(__file__).parents[3] / "shared" / "scenes"
+    scene = load_scene(scenes / "zdm2.glb")
+    camera = load_cameras(scenes / "zdm2.cameras.json").camera(frame)
+    samples = trace_view_samples(scene, replace(camera, viewport=Viewport(256, 256)))
+    casters = opaque_casters(scene)
+    low, high = scene.bounds_m
+    light = ShadowLight(tuple(low + (high - low) * np.array([0.45, 0.8, 0.55])))
+    receives = facing_samples(samples, light)
+    found = cast_shadows(technique, plan, samples, casters, light, receives=receives)
+    assert_equal_outside_the_bands(found.shadowed, samples, casters, light, default_bias_m(casters), 1e-3, receives)

@@ -1,0 +1,224 @@
+"""The walk of shadow volumes down a wide tree, by nodes: each node has the list of the triangles that may meet it.
+
+`wide_tree.walk` keeps pairs in order of queries. Here they are kept in order of nodes, which is what merging needs:
+whether any triangle accepts a node is a difference of two prefix sums, and the triangles of a leaf come out side by
+side. Lists are padded to groups, so that one row of the tree is loaded for a group and its tests pack into one word a
+child. Nothing is scattered and nothing sorted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, UInt32
+
+from vtfs.bit_lists import last_not_above, n_bits_set, nth_bit_set
+
+Hits = tuple[UInt32[Array, "groups branching"], UInt32[Array, "groups branching"], Int[Array, ""]]
+"""For each group and child: which of the group's triangles go on to the child, and which accept it; and any count."""
+
+
+class NodeLists(eqx.Module):
+    """The triangles listed at each node of one level, in groups.
+
+    Node `m` has groups `start[m]` to `start[m + 1]`, and `count[m]` triangles in them.
+
+    - `triangle`: of each group; what a list does not fill is `absent`, a triangle that meets nothing.
+    """
+
+    triangle: Int[Array, "groups lanes"]
+    start: Int[Array, " nodes_and_1"]
+    count: Int[Array, " nodes"]
+
+    @property
+    def n_groups(self) -> Int[Array, ""]:
+        return self.start[-1]
+
+    @property
+    def overflowed(self) -> Bool[Array, ""]:
+        return self.n_groups > self.triangle.shape[0]
+
+
+def group_starts(count: Int[Array, " nodes"], lanes: int) -> Int[Array, " nodes_and_1"]:
+    groups = -(-count // lanes)
+    # Saturates: past 2^31 a total would be negative, and look as if it fitted.
+    ends = jnp.minimum(jnp.cumsum(groups, dtype=jnp.int64), 2**30).astype(jnp.int32)
+    return jnp.concatenate([jnp.zeros(1, jnp.int32), ends])
+
+
+def one_list(member: Bool[Array, " triangles"], lanes: int, absent: int) -> NodeLists:
+    """The list of the root: every triangle that is a member."""
+    n = member.shape[0]
+    ends = jnp.cumsum(member, dtype=jnp.int32)
+    count = ends[-1:]
+    n_groups = -(-n // lanes)
+    place = jnp.arange(n_groups * lanes, dtype=jnp.int32)
+    # The k-th member is where the inclusive count first reaches k + 1.
+    found = last_not_above(jnp.concatenate([jnp.zeros(1, jnp.int32), ends]), place)
+    triangle = jnp.where(place < count, jnp.minimum(found, n - 1), absent)
+    return NodeLists(triangle.reshape(n_groups, lanes), group_starts(count, lanes), count)
+
+
+class Split(eqx.Module):
+    """What one level did.
+
+    - `lists`: of the children; `accepts`: how many triangles accept each child.
+    - `n_accepted`: (triangle, child) pairs accepted; `n_refined`: pairs that went on; `extra`: see `Hits`.
+    """
+
+    lists: NodeLists
+    accepts: Int[Array, " children"]
+    n_accepted: Int[Array, ""]
+    n_refined: Int[Array, ""]
+    extra: Int[Array, ""]
+
+
+def split(
+    lists: NodeLists,
+    test: Callable[[Int[Array, "chunk lanes"], Int[Array, " chunk"]], Hits],
+    drop: Callable[[Bool[Array, " children"]], Bool[Array, " children"]],
+    branching: int,
+    lanes: int,
+    absent: int,
+    capacity: int,
+    chunk: int,
+) -> Split:
+    """From the lists of a level to those of its children.
+
+    **Arguments:**
+
+    - `test`: hits of some groups, given their triangles and their node.
+    - `drop`: children whose lists are left out, given which are accepted.
+    - `lanes`: of the children's groups; `capacity`: children's groups.
+    - `chunk`: groups tested or written at once. Where it covers a capacity there is no loop.
+    """
+    n_in, lanes_in = lists.triangle.shape
+    n_groups = jnp.minimum(lists.n_groups, n_in)
+
+    # One bisection for all groups: in a loop its many small steps would each be a call.
+    node_of_group = last_not_above(lists.start, jnp.arange(_whole_chunks(n_in, chunk), dtype=jnp.int32))
+    node_of_group = jnp.minimum(node_of_group, lists.count.shape[0] - 1)
+
+    def test_chunk(first, n: int, before):
+        group = first + jnp.arange(n, dtype=jnp.int32)
+        node = jax.lax.dynamic_slice_in_dim(node_of_group, first, n)
+        triangle = jax.lax.dynamic_slice_in_dim(lists.triangle, first, n)
+        triangle = jnp.where((group < n_groups)[:, None], triangle, absent)
+        goes_on, accepts, extra = test(triangle, node)
+        both = jnp.concatenate([n_bits_set(goes_on), n_bits_set(accepts)], axis=1)
+        ends = jnp.cumsum(both, axis=0, dtype=jnp.int32) + before[None]
+        return goes_on, ends - both, ends[-1], extra
+
+    totals = jnp.zeros(2 * branching, jnp.int32)
+    if chunk >= n_in:
+        bits, below, totals, extra = test_chunk(jnp.int32(0), n_in, totals)
+        extra = extra.astype(jnp.int64)
+    else:
+        n_padded = _whole_chunks(n_in, chunk)
+
+        def loop(state):
+            first, bits, below, totals, extra = state
+            goes_on, starts, totals, more = test_chunk(first, chunk, totals)
+            bits = jax.lax.dynamic_update_slice_in_dim(bits, goes_on, first, 0)
+            below = jax.lax.dynamic_update_slice_in_dim(below, starts, first, 0)
+            return first + chunk, bits, below, totals, extra + more
+
+        padded = NodeLists(
+            jnp.pad(lists.triangle, ((0, n_padded - n_in), (0, 0)), constant_values=absent), lists.start, lists.count
+        )
+        lists = padded
+        state = (
+            jnp.int32(0),
+            jnp.zeros((n_padded, branching), jnp.uint32),
+            jnp.zeros((n_padded, 2 * branching), jnp.int32),
+            totals,
+            jnp.int64(0),
+        )
+        _, bits, below, totals, extra = jax.lax.while_loop(lambda state: state[0] < n_groups, loop, state)
+
+    # Counts of each (node, child), by the difference of what lies below its first and behind its last group.
+    n_rows = below.shape[0]
+
+    def below_at(group):
+        return jnp.where((group < n_groups)[:, None], below[jnp.minimum(group, n_rows - 1)], totals[None])
+
+    at = below_at(lists.start)
+    counts = at[1:] - at[:-1]
+    count, accepts = counts[:, :branching].reshape(-1), counts[:, branching:].reshape(-1)
+    accepted = accepts > 0
+    kept = jnp.where(drop(accepted), 0, count)
+    start = group_starts(kept, lanes)
+    n_out = jnp.minimum(start[-1], capacity)
+    widest = jnp.max(lists.start[1:] - lists.start[:-1])
+    flat_below, flat_bits = below.reshape(-1), bits.reshape(-1)
+    flat_triangle = lists.triangle.reshape(-1)
+
+    child_of_group = last_not_above(start, jnp.arange(_whole_chunks(capacity, chunk), dtype=jnp.int32))
+    child_of_group = jnp.minimum(child_of_group, kept.shape[0] - 1)
+
+    def write_chunk(first, n: int):
+        group = first + jnp.arange(n, dtype=jnp.int32)
+        child = jax.lax.dynamic_slice_in_dim(child_of_group, first, n)
+        node, which = child // branching, child % branching
+        k = ((group - start[child]) * lanes)[:, None] + jnp.arange(lanes, dtype=jnp.int32)
+        low, size = lists.start[node], lists.start[node + 1] - lists.start[node]
+        wanted = at[node, which][:, None] + k
+        # First where the group's first and last triangle come from; the others lie between.
+        ends = jnp.stack([wanted[:, 0], jnp.minimum(wanted[:, -1], at[node + 1, which] - 1)], axis=1)
+        ends = _last_not_above_in(flat_below, 2 * branching, which, low, size, ends, widest, n_in)
+        span = jnp.maximum(ends[:, 1] - ends[:, 0], 0) + 1
+        used = jnp.max(jnp.where(group < n_out, span, 1))
+        source = _last_not_above_in(flat_below, 2 * branching, which, ends[:, 0], span, wanted, used, n_in)
+        word = flat_bits[source * branching + which[:, None]]
+        bit = nth_bit_set(word, wanted - flat_below[source * 2 * branching + which[:, None]])
+        triangle = flat_triangle[source * lanes_in + jnp.minimum(bit, lanes_in - 1)]
+        is_there = (k < kept[child][:, None]) & (group < n_out)[:, None]
+        return jnp.where(is_there, triangle, absent)
+
+    if chunk >= capacity:
+        triangle = write_chunk(jnp.int32(0), capacity)
+    else:
+        n_padded = _whole_chunks(capacity, chunk)
+
+        def write(state):
+            first, triangle = state
+            return first + chunk, jax.lax.dynamic_update_slice_in_dim(triangle, write_chunk(first, chunk), first, 0)
+
+        state = (jnp.int32(0), jnp.full((n_padded, lanes), absent, jnp.int32))
+        _, triangle = jax.lax.while_loop(lambda state: state[0] < n_out, write, state)
+        triangle = triangle[:capacity]
+    return Split(
+        NodeLists(triangle, start, kept),
+        accepts,
+        jnp.sum(accepts, dtype=jnp.int64),
+        jnp.sum(kept, dtype=jnp.int64),
+        extra,
+    )
+
+
+def _whole_chunks(n: int, chunk: int) -> int:
+    return n if chunk >= n else -(-n // chunk) * chunk
+
+
+def _last_not_above_in(flat, stride: int, column, low, size, value, widest, capacity: int):
+    """For each value: the last of `size` rows from `low` whose entry in a column is not above it. Bisection."""
+    n_steps = max(capacity - 1, 1).bit_length()
+
+    def halve(i, at):
+        step = 1 << (n_steps - 1 - i) if isinstance(i, int) else jnp.int32(1) << (n_steps - 1 - i)
+        candidate = at + step
+        there = flat[jnp.minimum(low[:, None] + candidate, capacity - 1) * stride + column[:, None]]
+        return jnp.where((candidate < size[:, None]) & (there <= value), candidate, at)
+
+    at = jnp.zeros_like(value)
+    if jax.default_backend() == "cpu":
+        # Most lists are short: only the steps that the longest one needs.
+        needed = jnp.int32(32) - jax.lax.clz(jnp.maximum(widest - 1, 1)).astype(jnp.int32)
+        at = jax.lax.fori_loop(jnp.int32(n_steps) - jnp.minimum(needed, n_steps), jnp.int32(n_steps), halve, at)
+    else:
+        for i in range(n_steps):
+            at = halve(i, at)
+    return low[:, None] + at

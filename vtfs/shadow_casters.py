@@ -1,0 +1,99 @@
+"""What casts shadows: triangles in world space, and the light that they stand before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from vtfs.input_error import InputError
+
+if TYPE_CHECKING:
+    from vtfs.scene import Scene
+
+BIAS = 1e-5
+"""Samples move toward the light by this share of the casters' extent before the test against a triangle's own plane;
+within the window (1e-6 to 1e-4) in which self-shadowing was measured to vanish. Never an absolute length."""
+
+FrontFaces = Literal["cast", "culled"]
+
+
+@dataclass(frozen=True)
+class Casters:
+    """Triangles that cast shadows, in world space.
+
+    - `vertices_m`: float64 `[V, 3]`; `triangles`: int32 `[T, 3]`. Triangles that share an edge must share its vertices
+      for
+      their volumes to be watertight.
+
+    **Raises:** `InputError` where a vertex of a triangle is not finite or an index is out of range.
+    """
+
+    vertices_m: np.ndarray
+    triangles: np.ndarray
+
+    def __post_init__(self):
+        object.__setattr__(self, "vertices_m", np.ascontiguousarray(self.vertices_m, np.float64).reshape(-1, 3))
+        object.__setattr__(self, "triangles", np.ascontiguousarray(self.triangles, np.int32).reshape(-1, 3))
+        if len(self.triangles) == 0:
+            return
+        low, high = int(self.triangles.min()), int(self.triangles.max())
+        if low < 0 or high >= len(self.vertices_m):
+            wrong = low if low < 0 else high
+            raise InputError(f"casters `triangles`: index {wrong} is out of range; there are {len(self.vertices_m)}.")
+        bad = np.flatnonzero(~np.isfinite(self.vertices_m[self.triangles]).all(axis=(1, 2)))
+        if len(bad):
+            raise InputError(
+                f"casters `triangles`: triangle {bad[0]} ({len(bad)} in all) has a vertex that is NaN or infinite; "
+                "repair the mesh."
+            )
+        largest = float(np.abs(self.vertices_m[self.triangles]).max())
+        if largest > 1e36:
+            raise InputError(f"casters `vertices_m`: a coordinate of {largest:g} m is beyond 1e36; scale the scene.")
+
+    @property
+    def n_triangles(self) -> int:
+        return len(self.triangles)
+
+    @property
+    def extent_m(self) -> float:
+        """Diagonal of the box of all vertices that triangles use; what the bias is a share of."""
+        if not len(self.triangles):
+            return 0.0
+        used = self.vertices_m[self.triangles.ravel()]
+        return float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
+
+
+@dataclass(frozen=True)
+class ShadowLight:
+    """A point light, or a directional one, in world space.
+
+    - `position_m`: where a point light is; for a directional light a vector toward it, of any length.
+
+    **Raises:** `InputError` where it is not finite, or a direction is zero.
+    """
+
+    position_m: tuple[float, float, float]
+    directional: bool = False
+
+    def __post_init__(self):
+        if len(self.position_m) != 3 or not np.isfinite(self.position_m).all():
+            raise InputError(f"shadow light `position_m` = {self.position_m}: must be three finite numbers.")
+        if self.directional and not np.any(self.position_m):
+            raise InputError("shadow light `position_m` = (0, 0, 0): a directional light needs a direction toward it.")
+
+    @property
+    def homogeneous(self) -> np.ndarray:
+        """float64 `[4]`: position and 1, or unit direction toward the light and 0."""
+        position = np.asarray(self.position_m, np.float64)
+        if self.directional:
+            scaled = position / np.abs(position).max()  # so that no square overflows or vanishes
+            return np.append(scaled / np.linalg.norm(scaled), 0.0)
+        return np.append(position, 1.0)
+
+
+def opaque_casters(scene: Scene) -> Casters:
+    """The triangles of a scene's `opaque` materials; those of `mask` and `blend` cast other shadows."""
+    opaque = np.array([material.alpha_mode == "opaque" for material in scene.materials])
+    return Casters(scene.vertices_m, scene.triangles[opaque[scene.material_index]])

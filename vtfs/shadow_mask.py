@@ -1,0 +1,212 @@
+"""Shadow masks: what a light's shadow needs on the device, what comes out, and what it took."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from vtfs.cluster_grid import ClusterGrid
+from vtfs.gbuffer import Positions, positions_on_device, to_runs
+from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight
+from vtfs.shadow_volumes.planes import Extra
+
+if TYPE_CHECKING:
+    from vtfs.view_samples import ViewSamples
+
+Bounds = Literal["explicit", "implicit"]
+Stencil = Literal["unlimited", "wrap", "saturate"]
+
+
+class ShadowFrame(eqx.Module):
+    """View samples, casters and one light on the device.
+
+    - `receives`: samples that are tested; `grid`: of the clusters, with the tiles of the plan.
+    - `edges`: lower and higher vertex, and up to two triangles: `2 t` where triangle t runs from the lower to the
+      higher
+      one, `2 t + 1` where the other way, -1 for none.
+    - `vertex_m`: float64, world space, components apart; `view_from_world`: float64, its rotation.
+    - `eye_m`, `light_m`: float64, world space; a directional light is a unit vector toward it.
+    - `culls_front`: triangles that face the light cast nothing.
+    """
+
+    positions: Positions
+    receives: Bool[Array, "runs 32"]
+    grid: ClusterGrid
+    vertex_m: tuple[Float[Array, " vertices"], ...]
+    triangles: Int[Array, "triangles 3"]
+    edges: Int[Array, "edges 4"]
+    rotation: Float[Array, "3 3"]
+    eye_m: Float[Array, " 3"]
+    light_m: Float[Array, " 3"]
+    bias_m: Float[Array, ""]
+    culls_front: Bool[Array, ""]
+    directional: bool = eqx.field(static=True)
+
+
+@dataclass(frozen=True)
+class ShadowPlan:
+    """What is static in a shadow program: it fixes array shapes, or which tests there are.
+
+    - `extra`: planes for rejection besides the four of a volume.
+    - `feedback`: triangles go on only into nodes that no triangle of the same or an earlier batch accepts: same mask,
+      fewer tests.
+    - `batch`: triangles walked together, 0: all. Never changes the mask.
+    - `stencil`: of z-pass and z-fail: 8 bits that wrap or saturate, or no limit; `around_eye`: z-pass starts with the
+      volumes
+      around the eye, without which it fails where the camera stands in one.
+    - `clusters`, `groups`, `leaf_groups`: rounded capacities: of clusters and their blocks, of the lists of a level, of
+      the lists of tiles or clusters.
+    - `level_groups`: capacities of each level's lists. Then levels are unrolled and nothing loops, which suits a GPU;
+      without them one loop runs over levels of `groups`, in chunks, which suits a CPU.
+    """
+
+    tile_px: int = 8
+    branching: int = 32
+    bounds: Bounds = "explicit"
+    extra: Extra = "vertex"
+    feedback: bool = True
+    batch: int = 0
+    stencil: Stencil = "unlimited"
+    around_eye: bool = True
+    clusters: int = 0
+    groups: int = 0
+    leaf_groups: int = 0
+    level_groups: tuple[int, ...] = ()
+
+
+class ShadowCounts(eqx.Module):
+    """What a walk did, 64 bits; one entry a level of nodes, the root's children first.
+
+    - `node_tests`: (existing child, triangle) pairs tested; `accepted`, `refined`: of these; the rest is rejected.
+    - `extra_plane_tests`: pairs that neither the four planes reject nor accept, which the extra planes then test.
+    - `sample_tests`: (valid sample, triangle) pairs at the leaves, all samples of the tile, as the papers test;
+      `sample_tests_in_cluster`: only those of the cluster itself.
+    - `stencil_updates`: (sample, polygon) pairs that change a stencil; -1 for algorithms without one.
+    - `groups`: groups of each level's lists, the leaves' last: what the capacities must hold.
+    - `list_length`: triangles tested against each tile or cluster.
+    - `n_items`: occupied tiles or clusters; `n_blocks`: what `clusters` must hold.
+    - `n_casters`: triangles with a volume.
+    """
+
+    node_tests: Int[Array, " levels"]
+    accepted: Int[Array, " levels"]
+    refined: Int[Array, " levels"]
+    extra_plane_tests: Int[Array, " levels"]
+    sample_tests: Int[Array, ""]
+    sample_tests_in_cluster: Int[Array, ""]
+    stencil_updates: Int[Array, ""]
+    groups: Int[Array, " levels_and_1"]
+    list_length: Int[Array, " items"]
+    n_items: Int[Array, ""]
+    n_blocks: Int[Array, ""]
+    n_casters: Int[Array, ""]
+
+
+class ShadowMask(eqx.Module):
+    """Which samples a light does not reach.
+
+    - `shadowed`: false where nothing is tested.
+    - `overflowed`: a list did not fit its capacity: the mask is thrown away, never used.
+    - `tests`: triangles in the lists that each sample's tile or cluster was tested against.
+    """
+
+    shadowed: Bool[Array, "runs 32"]
+    overflowed: Bool[Array, ""]
+    tests: Int[Array, "runs 32"]
+    counts: ShadowCounts
+
+
+def facing_samples(samples: ViewSamples, light: ShadowLight) -> np.ndarray:
+    """Valid samples whose normal does not turn away from the light: bool `[h, w]`. The others are dark without a
+    test."""
+    matrix = samples.camera.view_from_world
+    light_world = light.homogeneous
+    light_view = matrix[:3, :3] @ light_world[:3] + light_world[3] * matrix[:3, 3]
+    to_light = light_view - light_world[3] * samples.position_m.astype(np.float64)
+    return samples.valid & ((to_light * samples.normal).sum(axis=-1) > 0)
+
+
+def default_bias_m(casters: Casters) -> float:
+    return BIAS * casters.extent_m
+
+
+class CastersOnDevice(eqx.Module):
+    """Triangles as the device reads them: float64, world space."""
+
+    vertex_m: tuple[Float[Array, " vertices"], ...]
+    triangles: Int[Array, "triangles 3"]
+    edges: Int[Array, "edges 4"]
+
+
+def edge_list(triangles: np.ndarray) -> np.ndarray:
+    """Edges as `ShadowFrame.edges`, int32 `[E, 4]`. An edge of more than two triangles is there several times."""
+    low_high = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
+    side = np.tile(2 * np.arange(len(triangles)), 3) + (low_high[:, 0] > low_high[:, 1])
+    low_high.sort(axis=1)
+    keep = low_high[:, 0] != low_high[:, 1]
+    low_high, side = low_high[keep], side[keep]
+    order = np.lexsort((side, low_high[:, 1], low_high[:, 0]))
+    low_high, side = low_high[order], side[order]
+    is_first = np.ones(len(order), bool)
+    is_first[1:] = (low_high[1:] != low_high[:-1]).any(axis=1)
+    place = np.arange(len(order)) - np.maximum.accumulate(np.where(is_first, np.arange(len(order)), 0))
+    first = np.flatnonzero(place % 2 == 0)
+    has_second = np.zeros(len(first), bool)
+    has_second[: len(first)] = (first + 1 < len(order)) & (place[np.minimum(first + 1, len(order) - 1)] % 2 == 1)
+    second = np.where(has_second, side[np.minimum(first + 1, len(order) - 1)], -1)
+    return np.column_stack([low_high[first], side[first], second]).astype(np.int32)
+
+
+def casters_on_device(casters: Casters) -> CastersOnDevice:
+    """Upload casters; none at all become one triangle without area, as XLA cannot gather from nothing."""
+    vertices, triangles = casters.vertices_m, casters.triangles
+    if not len(triangles):
+        vertices, triangles = np.zeros((1, 3)), np.zeros((1, 3), np.int32)
+    with jax.enable_x64(True):
+        return CastersOnDevice(
+            tuple(jax.device_put(np.ascontiguousarray(vertices[:, c])) for c in range(3)),
+            jax.device_put(triangles),
+            jax.device_put(edge_list(triangles)),
+        )
+
+
+def shadow_frame(
+    samples: ViewSamples,
+    casters: CastersOnDevice,
+    light: ShadowLight,
+    grid: ClusterGrid,
+    bias_m: float,
+    receives: np.ndarray | None = None,
+    front_faces: FrontFaces = "cast",
+    positions: Positions | None = None,
+) -> ShadowFrame:
+    """What a shadow program starts from.
+
+    **Arguments:**
+
+    - `receives`: samples that are tested, bool `[h, w]`; all valid ones unless given.
+    - `positions`: of the samples, if they are on the device already.
+    """
+    camera = samples.camera
+    mask = samples.valid if receives is None else receives & samples.valid
+    with jax.enable_x64(True):
+        put: Any = jax.device_put
+        return ShadowFrame(
+            positions=positions_on_device(samples) if positions is None else positions,
+            receives=put(to_runs(mask)),
+            grid=grid,
+            vertex_m=casters.vertex_m,
+            triangles=casters.triangles,
+            edges=casters.edges,
+            rotation=put(np.ascontiguousarray(camera.view_from_world[:3, :3])),
+            eye_m=put(np.asarray(camera.eye_m, np.float64)),
+            light_m=put(light.homogeneous[:3]),
+            bias_m=put(np.float64(bias_m)),
+            culls_front=put(np.bool_(front_faces == "culled")),
+            directional=light.directional,
+        )

@@ -1,0 +1,273 @@
+"""The shadow techniques, and how one is run: capacities that fit, the program, the mask and what it took."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from vtfs.cluster_grid import cluster_grid
+from vtfs.gbuffer import from_runs
+from vtfs.input_error import InputError
+from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight
+from vtfs.shadow_mask import (
+    CastersOnDevice,
+    ShadowFrame,
+    ShadowMask,
+    ShadowPlan,
+    casters_on_device,
+    default_bias_m,
+    shadow_frame,
+)
+from vtfs.shadow_volumes.cluster_hierarchy import cluster_hierarchy
+from vtfs.shadow_volumes.ptsv import ptsv
+from vtfs.shadow_volumes.sample_tiles import KEY_BITS
+from vtfs.shadow_volumes.z_fail import z_fail
+from vtfs.shadow_volumes.z_pass import z_pass
+from vtfs.view_samples import ViewSamples
+
+if TYPE_CHECKING:
+    from vtfs.cluster_grid import ClusterGrid
+
+log = logging.getLogger("vtfs.shadows")
+
+ShadowTechnique = Callable[[ShadowFrame, ShadowPlan], ShadowMask]
+
+SHADOW_TECHNIQUES: dict[str, ShadowTechnique] = {
+    "z_pass": z_pass,
+    "z_fail": z_fail,
+    "ptsv": ptsv,
+    "cluster_hierarchy": cluster_hierarchy,
+}
+"""Shadow techniques of one signature. What differs from one plan to another is in the plan."""
+
+_FIRST = ShadowPlan(clusters=2**12, groups=2**10, leaf_groups=2**13)
+_LARGEST = 2**26
+
+
+def shadow_grid(samples: ViewSamples, tile_px: int, depth_slices: int = 0) -> ClusterGrid:
+    """The grid of clusters of a view.
+
+    **Raises:** `InputError` where it has more columns, rows or slices than keys can tell apart.
+    """
+    depths = -samples.position_m[..., 2][samples.valid]
+    deepest_m = float(depths.max(initial=samples.camera.near_m))
+    grid = cluster_grid(samples.camera, tile_px, depth_slices, deepest_m)
+    n_slices = int(grid.depth_slices)
+    if n_slices > 2**KEY_BITS:
+        raise InputError(
+            f"tile_px={tile_px} with depth_slices={depth_slices} makes {n_slices:,} slices: shadow clusters have at "
+            f"most {2**KEY_BITS:,}; use larger tiles or fewer slices."
+        )
+    return grid
+
+
+@functools.cache
+def counting_program(technique: str, plan: ShadowPlan) -> Callable[[ShadowFrame], ShadowMask]:
+    """A technique as one program, from view samples to mask and counts; to be called inside `jax.enable_x64(True)`."""
+
+    def run(frame: ShadowFrame) -> ShadowMask:
+        return SHADOW_TECHNIQUES[technique](frame, plan)
+
+    return jax.jit(run)
+
+
+@functools.cache
+def shadow_program(technique: str, plan: ShadowPlan) -> Callable[[ShadowFrame], tuple[Any, Any]]:
+    """The program that is timed: mask and overflow alone, so that XLA deletes the counting."""
+
+    def run(frame: ShadowFrame) -> tuple[Any, Any]:
+        mask = SHADOW_TECHNIQUES[technique](frame, plan)
+        return mask.shadowed, mask.overflowed
+
+    return jax.jit(run)
+
+
+def run_program(technique: str, plan: ShadowPlan, frame: ShadowFrame) -> ShadowMask:
+    """Run and count; in float64, which is set nowhere else."""
+    with jax.enable_x64(True):
+        return counting_program(technique, plan)(frame)
+
+
+def _rounded_up(name: str, needed: int, first: int) -> int:
+    """Powers of 2 from the first size on.
+
+    **Raises:** `InputError` where no capacity holds that many.
+    """
+    if needed > _LARGEST:
+        raise InputError(f"shadows: {needed:,} {name} needed, at most {_LARGEST:,} fit; use larger tiles or a batch.")
+    return max(first, 1 << (max(needed, 1) - 1).bit_length())
+
+
+def fitted(technique: str, plan: ShadowPlan, frame: ShadowFrame, unrolled: bool | None = None) -> ShadowPlan:
+    """The plan with capacities that hold a frame, found by running it.
+
+    **Arguments:**
+
+    - `unrolled`: without loops, each level with its own capacity; unless given, where the device is no CPU.
+    """
+    n_samples = int(np.prod(frame.receives.shape))
+    plan = replace(
+        plan,
+        clusters=plan.clusters or _rounded_up("clusters", n_samples // 8, _FIRST.clusters),
+        groups=plan.groups or _rounded_up("lists", frame.triangles.shape[0], _FIRST.groups),
+        leaf_groups=plan.leaf_groups or _rounded_up("leaf lists", n_samples // 8, _FIRST.leaf_groups),
+        level_groups=(),
+    )
+    while True:
+        mask = run_program(technique, plan, frame)
+        needed = np.asarray(mask.counts.groups).astype(np.int64)
+        if not bool(mask.overflowed):
+            break
+        n_blocks = int(mask.counts.n_blocks)
+        grown = replace(plan, clusters=_rounded_up("clusters", n_blocks, plan.clusters))
+        if n_blocks <= plan.clusters:  # else the lists are meaningless
+            grown = replace(
+                grown,
+                groups=_rounded_up("lists", _more(needed[:-1].max(), plan.groups), plan.groups),
+                leaf_groups=_rounded_up("leaf lists", _more(needed[-1], plan.leaf_groups), plan.leaf_groups),
+            )
+        log.info("%s: %s does not fit, trying %s", technique, plan, grown)
+        if grown == plan:
+            raise InputError(f"{technique}: the frame fits no capacity; use larger tiles or a batch.")
+        plan = grown
+    if jax.default_backend() != "cpu" if unrolled is None else unrolled:
+        levels = tuple(_rounded_up("lists", int(n), 2**6) for n in needed[1:-1])
+        leaf_groups = _rounded_up("leaf lists", int(needed[-1]), 2**6)
+        if levels:
+            plan = replace(plan, level_groups=levels, leaf_groups=leaf_groups, groups=0)
+    return plan
+
+
+def _more(needed: np.integer, capacity: int) -> int:
+    """Four times as many where a level did not fit: those below it are cut, and need more than they say."""
+    return max(int(needed), 4 * capacity) if needed > capacity else 1
+
+
+@dataclass(frozen=True)
+class CastShadows:
+    """A mask on the host.
+
+    - `shadowed`: bool `[h, w]`; false where nothing was tested.
+    - `tests`: int32 `[h, w]`: triangles that each sample's tile or cluster was tested against: a heat map.
+    - `counts`: see `shadow_counts`; `plan`: with the capacities that held the frame.
+    """
+
+    shadowed: np.ndarray
+    tests: np.ndarray
+    counts: dict[str, int]
+    plan: ShadowPlan
+
+
+def cast_shadows(
+    technique: str,
+    plan: ShadowPlan,
+    samples: ViewSamples,
+    casters: Casters,
+    light: ShadowLight,
+    depth_slices: int = 0,
+    front_faces: FrontFaces = "cast",
+    receives: np.ndarray | None = None,
+    bias_m: float | None = None,
+) -> CastShadows:
+    """The shadow of one light on a view: sized, run and brought to the host.
+
+    **Arguments:** as of `shadow_frame`; `bias_m` is 1e-5 of the casters' extent unless given.
+
+    **Raises:** `InputError` for an unknown technique, or where no capacity holds the frame.
+    """
+    if technique not in SHADOW_TECHNIQUES:
+        raise InputError(f"shadow technique `{technique}`: unknown; choose from {', '.join(SHADOW_TECHNIQUES)}.")
+    bias = default_bias_m(casters) if bias_m is None else bias_m
+    grid = shadow_grid(samples, plan.tile_px, depth_slices)
+    frame = shadow_frame(samples, casters_on_device(casters), light, grid, bias, receives, front_faces)
+    plan = fitted(technique, plan, frame)
+    return on_host(run_program(technique, plan, frame), plan, frame)
+
+
+def on_host(mask: ShadowMask, plan: ShadowPlan, frame: ShadowFrame) -> CastShadows:
+    """Bring a mask and its counts to the host.
+
+    **Raises:** `InputError` where it overflowed: such a mask is never used.
+    """
+    if bool(mask.overflowed):
+        raise InputError("shadows: the frame no longer fits the capacities that its sizing run found.")
+    viewport = frame.positions.viewport
+    return CastShadows(
+        from_runs(np.asarray(mask.shadowed), viewport),
+        from_runs(np.asarray(mask.tests), viewport),
+        shadow_counts(mask, frame, plan),
+        plan,
+    )
+
+
+def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dict[str, int]:
+    """Counts of a shadow technique.
+
+    - `test_and_set`: (existing node or valid sample, triangle) pairs tested; at leaves all samples of the tile, as in
+      the
+      papers. `test_and_set_in_cluster` counts there only the samples of the cluster itself. With a stencil: one for
+      each
+      sample and volume polygon that passes (z_pass) or fails (z_fail) the depth test; what the tiles cost stays apart.
+    - `node_tests_0` ...: of them, on each level below the root; `accepted_*`, `refined_*` likewise, the others are
+      rejected.
+    - `extra_plane_tests`: planes tested beyond the four of a volume.
+    - `memory`: bytes of the structures at their capacities.
+    """
+    counts = mask.counts
+    nodes, accepted, refined, extra = (
+        np.asarray(column).astype(np.int64)
+        for column in (counts.node_tests, counts.accepted, counts.refined, counts.extra_plane_tests)
+    )
+    per_level = {
+        f"{name}_{level}": int(value)
+        for name, column in (("node_tests", nodes), ("accepted", accepted), ("refined", refined))
+        for level, value in enumerate(column)
+    }
+    updates = int(counts.stencil_updates)
+    on_nodes = int(nodes.sum())
+    lengths = np.asarray(counts.list_length).astype(np.int64)
+    return {
+        "samples": int(np.asarray(frame.receives).sum()),
+        "casters": int(counts.n_casters),
+        "items": int(counts.n_items),
+        "test_and_set": updates if updates >= 0 else on_nodes + int(counts.sample_tests),
+        "test_and_set_in_cluster": updates if updates >= 0 else on_nodes + int(counts.sample_tests_in_cluster),
+        "node_tests": on_nodes,
+        "sample_tests": int(counts.sample_tests),
+        "extra_plane_tests": 3 * int(extra.sum()),
+        "longest_list": int(lengths.max(initial=0)),
+        "listed_pairs": int(lengths.sum()),
+        "memory": _memory(plan, frame),
+        **per_level,
+    }
+
+
+def _memory(plan: ShadowPlan, frame: ShadowFrame) -> int:
+    """Lists of all levels that are held at once, planes of all triangles, and the tree."""
+    groups = sum(plan.level_groups) if plan.level_groups else 2 * plan.groups
+    lists = 4 * (32 * groups + 4 * plan.leaf_groups) + 12 * plan.branching * groups
+    planes = frame.triangles.shape[0] * (8 * 10 + 4 + 4 * (13 + (9 if plan.extra != "off" else 0)))
+    n_items = plan.clusters or int(np.prod(frame.receives.shape)) // plan.tile_px**2
+    tree = 24 * n_items * plan.branching // (plan.branching - 1)
+    samples = 16 * int(np.prod(frame.receives.shape))
+    return lists + planes + tree + samples
+
+
+__all__ = [
+    "SHADOW_TECHNIQUES",
+    "CastShadows",
+    "CastersOnDevice",
+    "cast_shadows",
+    "fitted",
+    "on_host",
+    "run_program",
+    "shadow_counts",
+    "shadow_grid",
+    "shadow_program",
+]

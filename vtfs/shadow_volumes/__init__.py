@@ -1,0 +1,1 @@
+"""Exact shadows by shadow volumes: one file an algorithm, one signature."""

@@ -1,0 +1,30 @@
+"""Per-triangle shadow volumes: every volume down the depth hierarchy of the image (Sintorn et al. 2011)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
+from vtfs.shadow_volumes.sample_tiles import depth_parts, sample_tiles, tile_order
+from vtfs.shadow_volumes.walk import mask_of, node_table, volumes, walk_volumes
+
+
+def ptsv(frame: ShadowFrame, plan: ShadowPlan) -> ShadowMask:
+    """Shadows by a hierarchy of least and greatest depths.
+
+    A node is a rectangle of the image between two depths; `branching` 32 makes 8 x 4 and 4 x 8 in turn. Its leaves are
+    tiles of `tile_px` squared samples, all of which are tested.
+    """
+    samples = sample_tiles(frame.positions, frame.receives, plan.tile_px)
+    tile, place_of = tile_order(samples.columns, samples.rows)
+    parts = depth_parts(samples, frame.grid)
+    table = node_table(parts, plan.branching, is_frustum=True)
+    volume = volumes(frame, plan, about_light=False)
+    tiles = jnp.asarray(np.maximum(tile, 0))
+    n_received = jnp.sum(samples.receives, axis=1, dtype=jnp.int32)
+    in_item = jnp.where(jnp.asarray(tile >= 0), n_received[tiles], 0)
+    walked = walk_volumes(volume, table, samples, tiles, True, plan)
+    item_of_sample = jnp.broadcast_to(jnp.asarray(place_of)[:, None], samples.receives.shape)
+    n_items = jnp.sum(in_item > 0, dtype=jnp.int32)
+    return mask_of(walked, volume.safe, samples, item_of_sample, in_item, in_item, n_items, jnp.int32(0), False)

@@ -1,0 +1,233 @@
+"""Stencil shadow volumes: the polygons around volumes, counted along the line from the eye to each sample.
+
+Each polygon is walked down the tree of tiles as a volume seen from the eye: a sample has the polygon before it where
+it lies in its cone and beyond its plane. So nothing is rasterised, and no polygon meets every sample. Sides are drawn
+for silhouette edges where two triangles share an edge, and for every edge where they do not, twice where both of two
+triangles need them (Sintorn et al. 2011, Sec. 5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from vtfs.bounds import Aabb
+from vtfs.gbuffer import Positions
+from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
+from vtfs.shadow_volumes.planes import (
+    BELOW_ZERO,
+    SMALLEST_VOLUME,
+    EdgePlanes,
+    NodePlanes,
+    Vector,
+    corners,
+    cross,
+    dot,
+    edge_planes,
+    first_is_positive,
+    inside,
+    length,
+    minus,
+    plane_table,
+    times,
+    unit,
+)
+from vtfs.shadow_volumes.sample_tiles import SampleTiles, in_runs, sample_tiles, tile_order
+from vtfs.shadow_volumes.walk import Volumes, Walk, count_volumes, mask_of, node_table, rotated
+
+
+class Polygons(eqx.Module):
+    """Triangles with vertices that may lie at infinity, and where a line from the eye crosses them: in (1) or out (-1).
+
+    - `vertex`: eye-relative position, or direction where `finite` is 0; `index`: of each triangle's vertices.
+    - `crossing`: 0 where a polygon is not drawn.
+    """
+
+    vertex: Vector
+    finite: Float[Array, " vertices"]
+    index: Int[Array, "polygons 3"]
+    crossing: Int[Array, " polygons"]
+
+
+def stencil_mask(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> ShadowMask:
+    """Shadows by counting the polygons before each sample (z-pass) or behind it (z-fail).
+
+    Samples are moved toward the light by the bias.
+    """
+    origin = frame.eye_m
+    vertex = rotated(frame, tuple(c - origin[k] for k, c in enumerate(frame.vertex_m)))
+    light = rotated(frame, tuple(frame.light_m if frame.directional else frame.light_m - origin))
+    zero = jnp.float64(0)
+    apex = tuple(jnp.zeros(3, jnp.float64)) if frame.directional else light
+    about_light = tuple(c - o for c, o in zip(vertex, apex, strict=True))
+    planes, inward = edge_planes(about_light, frame.triangles, light, frame.directional, zero, frame.culls_front)
+    polygons = _polygons(frame, vertex, light, apex, inward, by_failing)
+    around_eye = jnp.sum(inside(planes, tuple(-o for o in apex), zero), dtype=jnp.int32)
+
+    samples = sample_tiles(_moved(frame, light), frame.receives, plan.tile_px)
+    tile, place_of = tile_order(samples.columns, samples.rows)
+    table = node_table(_tile_boxes(samples, tile), plan.branching, is_frustum=False)
+    tiles = jnp.asarray(np.maximum(tile, 0))
+    plain = replace(plan, feedback=False, extra="off", batch=0)
+
+    def count(crossing: Array) -> tuple[Array, Walk]:
+        volume = _seen_volumes(polygons, polygons.crossing == crossing, by_failing)
+        return count_volumes(volume, table, samples, tiles, plain)
+
+    # One after the other by the same code: it is compiled once.
+    (entered, left), walks = jax.lax.map(count, jnp.array([1, -1], jnp.int32))
+    added, taken = (left, entered) if by_failing else (entered, left)
+    before = around_eye if plan.around_eye and not by_failing else jnp.int32(0)
+    if plan.stencil == "saturate":  # all that add are drawn first
+        is_set = jnp.maximum(jnp.minimum(before + added, _LARGEST) - taken, 0) > 0
+    elif plan.stencil == "wrap":
+        is_set = (before + added - taken) % (_LARGEST + 1) != 0
+    else:
+        is_set = before + added != taken
+    n_in_tile = jnp.where(jnp.asarray(tile >= 0), jnp.sum(samples.receives, axis=1, dtype=jnp.int32)[tiles], 0)
+    item_of_sample = jnp.broadcast_to(jnp.asarray(place_of)[:, None], samples.receives.shape)
+    result = mask_of(
+        _together(walks), inward != 0, samples, item_of_sample, n_in_tile, n_in_tile, jnp.sum(n_in_tile > 0,
+        dtype=jnp.int32),
+        jnp.int32(0), False,
+    )  # fmt: skip
+    places = jnp.asarray(place_of)
+    updates = jnp.sum(jnp.where(samples.receives, (added + taken)[places], 0), dtype=jnp.int64)
+    shadowed = in_runs(samples.receives & is_set[places], samples.viewport, samples.tile_px)
+    counts = eqx.tree_at(lambda counts: counts.stencil_updates, result.counts, updates)
+    return ShadowMask(shadowed, result.overflowed, result.tests, counts)
+
+
+_LARGEST = 255
+"""Of a stencil of 8 bits."""
+
+
+def _moved(frame: ShadowFrame, light: Vector) -> Positions:
+    """The samples, each moved toward the light by the bias, at most onto it."""
+    at = tuple(c.astype(jnp.float64) for c in (frame.positions.x_m, frame.positions.y_m, frame.positions.z_m))
+    way = light if frame.directional else minus(light, at)
+    share = frame.bias_m / jnp.maximum(length(way), frame.bias_m) if not frame.directional else frame.bias_m
+    x, y, z = ((a + share * w).astype(jnp.float32) for a, w in zip(at, way, strict=True))
+    return Positions(x, y, z, frame.positions.valid, frame.positions.viewport)
+
+
+def _tile_boxes(samples: SampleTiles, tile: np.ndarray) -> Aabb:
+    """Boxes of the samples of each tile, in the order of the tree; empty where there are none."""
+    index = jnp.asarray(np.maximum(tile, 0))
+
+    def extent(value: Array) -> tuple[Array, Array]:
+        low = jnp.min(jnp.where(samples.receives, value, jnp.inf), axis=1)[index]
+        high = jnp.max(jnp.where(samples.receives, value, -jnp.inf), axis=1)[index]
+        return jnp.where(tile >= 0, low, jnp.float32(jnp.inf)), jnp.where(tile >= 0, high, jnp.float32(-jnp.inf))
+
+    (low_x, high_x), (low_y, high_y), (low_z, high_z) = map(extent, (samples.x_m, samples.y_m, samples.z_m))
+    return Aabb(low_x, low_y, low_z, high_x, high_y, high_z)
+
+
+def _polygons(
+    frame: ShadowFrame, vertex: Vector, light: Vector, apex: Vector, inward: Float[Array, " triangles"], with_caps: bool
+) -> Polygons:
+    """Sides of all volumes, each as two triangles that reach to infinity, and the caps at both ends.
+
+    An edge's weight is the number of volumes that need it as a side, with the side on which they lie: two triangles
+    that
+    both face the light cancel, and at a silhouette both need it.
+    """
+    n_vertices = vertex[0].shape[0]
+    away = tuple(jnp.broadcast_to(-c, vertex[0].shape) for c in light) if frame.directional else minus(vertex, apex)
+    both = tuple(jnp.concatenate(parts) for parts in zip(vertex, away, strict=True))
+    finite = jnp.concatenate([jnp.ones(n_vertices), jnp.zeros(n_vertices)])
+    low, high = frame.edges[:, 0], frame.edges[:, 1]
+    # A directional light has one point at infinity.
+    low_far, high_far = (n_vertices + (jnp.zeros_like(e) if frame.directional else e) for e in (low, high))
+    facing = -inward.astype(jnp.int32)
+    weight = jnp.zeros(low.shape, jnp.int32)
+    for side in (frame.edges[:, 2], frame.edges[:, 3]):
+        turn = jnp.where(side % 2 == 0, 1, -1) * facing[jnp.maximum(side, 0) // 2]
+        weight = weight + jnp.where(side >= 0, turn, 0)
+    a, b = (tuple(c[end] for c in vertex) for end in (low, high))
+    if frame.directional:
+        normal = cross(light, minus(a, b))
+        before = -dot(normal, a)
+    else:
+        normal = cross(minus(a, apex), minus(b, apex))
+        before = -dot(normal, apex)
+    crossing = jnp.sign(weight) * jnp.sign(before).astype(jnp.int32)
+    quads = [jnp.stack([low, high, low_far], axis=1), jnp.stack([high, high_far, low_far], axis=1)]
+    index = [quad for quad in quads for _ in range(2)]
+    drawn = [jnp.where(jnp.abs(weight) > copy, crossing, 0) for _ in range(2) for copy in range(2)]
+    if with_caps:
+        v0 = tuple(c[frame.triangles[:, 0]] for c in vertex)
+        e1, e2 = (minus(tuple(c[frame.triangles[:, k]] for c in vertex), v0) for k in (1, 2))
+        face = cross(e1, e2)
+        # The side of the eye, for a normal toward the light.
+        index.append(frame.triangles)
+        drawn.append(jnp.sign(dot(face, v0) * inward).astype(jnp.int32))
+        if not frame.directional:
+            index.append(frame.triangles + n_vertices)
+            drawn.append(jnp.where(inward != 0, -1, 0))
+    return Polygons(both, finite, jnp.concatenate(index), jnp.concatenate(drawn))
+
+
+def _seen_volumes(polygons: Polygons, drawn: Bool[Array, " polygons"], before: bool) -> Volumes:
+    """The volumes of polygons as seen from the eye: beyond them, or `before` them.
+
+    With barycentric weights that sum to the product of the face's normal over vertices at finite places, one formula
+    holds for
+    all polygons.
+    """
+    corner = corners(polygons.vertex, polygons.index)
+    normals = []
+    for k in range(3):
+        first, second = (k + 1) % 3, (k + 2) % 3
+        in_order = polygons.index[:, first] < polygons.index[:, second]
+        lower = tuple(jnp.where(in_order, a, b) for a, b in zip(corner[first], corner[second], strict=True))
+        upper = tuple(jnp.where(in_order, b, a) for a, b in zip(corner[first], corner[second], strict=True))
+        normals.append(times(cross(lower, upper), jnp.where(in_order, 1.0, -1.0)))
+    volume = dot(normals[0], corner[0])
+    bound = sum(length(normals[k]) * length(corner[k]) for k in range(3))
+    keeps = drawn & (jnp.abs(volume) > SMALLEST_VOLUME * bound)
+    sign = jnp.where(keeps, jnp.sign(volume), 0.0)
+    normals = [times(normal, sign) for normal in normals]
+    weight = [polygons.finite[polygons.index[:, k]] for k in range(3)]
+    face = tuple(dot(tuple(weight), tuple(normal[c] for normal in normals)) for c in range(3))
+    flip = -1.0 if before else 1.0
+    face, behind = times(face, jnp.float64(flip)), flip * volume * sign
+    behind = jnp.where(keeps, behind, jnp.inf)
+
+    def last(values: Array, absent: float = 0.0) -> Array:
+        return jnp.concatenate([values, jnp.full(1, absent, values.dtype)])
+
+    edges = EdgePlanes(
+        tuple(tuple(map(last, normal)) for normal in normals),
+        (),
+        tuple(last(jnp.where(first_is_positive(normal), BELOW_ZERO, 0.0)) for normal in normals),
+        tuple(map(last, face)),
+        last(behind, jnp.inf),
+    )
+    size = length(face)
+    # A cap at infinity has no plane: all samples are before it, none beyond.
+    offset = jnp.where(size > 0, behind / jnp.where(size > 0, size, 1.0), behind)
+
+    def narrow(v: Vector) -> Vector:
+        return tuple(last(c).astype(jnp.float32) for c in v)
+
+    nodes = NodePlanes(
+        tuple(narrow(unit(normal)) for normal in normals), narrow(unit(face)), (),
+        (last(offset, jnp.inf).astype(jnp.float32),),
+    )  # fmt: skip
+    zero = jnp.zeros(3, jnp.float64)
+    return Volumes(plane_table(edges), plane_table(nodes), keeps, tuple(zero), jnp.float64(0))
+
+
+def _together(walks: Walk) -> Walk:
+    """Two walks of the same tree, stacked, as one."""
+    total = jax.tree.map(lambda c: jnp.sum(c, axis=0, dtype=c.dtype), walks)
+    return eqx.tree_at(
+        lambda walk: (walk.groups, walk.overflowed), total, (jnp.max(walks.groups, axis=0), jnp.any(walks.overflowed))
+    )
