@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vtfs.cluster_grid import ClusterGrid
-from vtfs.gbuffer import Positions, positions_on_device, to_runs
+from vtfs.gbuffer import Fragments, Positions, to_runs
 from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight
 from vtfs.shadow_volumes.planes import Extra
 
@@ -197,7 +197,7 @@ def shadow_frame(
     with jax.enable_x64(True):
         put: Any = jax.device_put
         return ShadowFrame(
-            positions=positions_on_device(samples) if positions is None else positions,
+            positions=Fragments(samples, with_hidden=False).positions() if positions is None else positions,
             receives=put(to_runs(mask)),
             grid=grid,
             vertex_m=casters.vertex_m,
