@@ -219,7 +219,7 @@ def list_bits(
         # Saturates: past 2^31 a total would be negative, and look as if it fitted.
         return first + chunk, columns, jnp.minimum(total, _SATURATED) + n_hits, before
 
-    empty = tuple(jax.lax.empty(capacity + chunk, jnp.int32) for _ in range(n_columns))
+    empty = tuple(jnp.zeros(capacity + chunk, jnp.int32) for _ in range(n_columns))
     _, columns, total, before = jax.lax.while_loop(
         lambda state: state[0] < n_rows, list_chunk, (jnp.int32(0), empty, jnp.int32(0), jnp.zeros_like(mark))
     )

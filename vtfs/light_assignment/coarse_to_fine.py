@@ -196,7 +196,7 @@ def _test_blocks(
         words = test(first + jnp.arange(step, dtype=jnp.int32))
         return first + step, jax.lax.dynamic_update_slice(hits, words, (first, 0))
 
-    empty = jax.lax.empty((most_blocks + step, branching), jnp.uint32)
+    empty = jnp.zeros((most_blocks + step, branching), jnp.uint32)
     return jax.lax.while_loop(lambda state: state[0] < blocks.total, test_chunk, (jnp.int32(0), empty))[1]
 
 
