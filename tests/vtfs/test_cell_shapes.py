@@ -1,6 +1,7 @@
 """Spheres against the cells themselves: the exact test is that of float64 geometry, the others keep all it keeps."""
 
 import math
+from typing import Any
 
 import jax
 import numpy as np
@@ -26,7 +27,11 @@ jitted = {test: jax.jit(test) for test in TESTS}
 SLACK = 3e-6  # three times the bound of `bounds.SLACK`, relative to all magnitudes: what a test may accept besides
 
 
-def a_section(rng, parallel):
+def f32(*values: float) -> Any:
+    return [np.float32(value) for value in values]
+
+
+def a_section(rng, parallel) -> Any:
     """Edges of a tile anywhere on an image of up to 170 degrees, thin and thick slices, near 0.01 to 10 m."""
     size = 10 ** rng.uniform(-4, 1, 2)
     left, bottom = rng.normal(size=2) * 10 ** rng.uniform(-2, 1)
@@ -34,7 +39,7 @@ def a_section(rng, parallel):
     far_m = near_m * (1 + 10 ** rng.uniform(-3, 3))
     edges = tuple(float(np.float32(e)) for e in (left, left + size[0], bottom, bottom + size[1]))
     near_m, far_m, view_near_m = (float(np.float32(d)) for d in (near_m, far_m, near_m * rng.choice([1, 0.1])))
-    section = CellSections(*map(np.float32, (*edges, near_m, far_m, not parallel, view_near_m)))
+    section = CellSections(*f32(*edges, near_m, far_m, not parallel, view_near_m))
     return section, edges, near_m, far_m, view_near_m
 
 
@@ -129,7 +134,7 @@ def test_the_screen_rectangle_is_that_of_the_tangents(seed):
 
 @pytest.mark.parametrize("test", TESTS, ids=lambda f: f.__name__)
 def test_a_light_at_infinity_meets_nothing_and_a_huge_one_everything(test):
-    section = CellSections(*map(np.float32, (-0.5, 0.0, 0.0, 0.5, 1.0, 2.0, 1, 1.0)))
+    section = CellSections(*f32(-0.5, 0.0, 0.0, 0.5, 1.0, 2.0, 1, 1.0))
     for x, radius, expected in ((np.inf, 0.0, False), (np.inf, 1e18, False), (3.0, 1e15, True), (-0.3, 0.0, True)):
         centre = np.array([[x, 0.2, -1.5]])
         assert met(test, centre, np.array([radius]), section).tolist() == [expected]
@@ -147,7 +152,7 @@ def test_a_section_within_a_box_holds_what_is_in_both(seed, parallel):
     ).astype(np.float32)
     few = point[: rng.integers(1, 20)]
     low, high = few.min(0), few.max(0)
-    part = within_box(section, Aabb(*low, *high))
+    part = within_box(section, Aabb(*f32(*low, *high)))
     depth_m = -few[:, 2].astype(np.float64)
     slope = few[:, :2] / (1 if parallel else depth_m)[..., None] if not parallel else few[:, :2].astype(np.float64)
     rounding = 3e-7 * np.abs(slope)  # the sample's own float32 may lie outside the cell
