@@ -55,7 +55,8 @@ def spheres_about(corners, rng):
 
 
 def met(test, centre, radius, section):
-    return np.asarray(jitted[test](Sphere(*centre.astype(np.float32).T, radius.astype(np.float32)), section))
+    sphere: Any = [*centre.astype(np.float32).T, radius.astype(np.float32)]
+    return np.asarray(jitted[test](Sphere(*sphere), section))
 
 
 def magnitude(centre, edges, far_m, parallel):
@@ -148,13 +149,13 @@ def test_a_section_within_a_box_holds_what_is_in_both(seed, parallel):
     depth_m = rng.uniform(near_m, far_m, 20)
     width = 1 if parallel else depth_m
     point = np.stack(
-        [rng.uniform(*edges[:2], 20) * width, rng.uniform(*edges[2:], 20) * width, -depth_m], axis=1
+        [rng.uniform(edges[0], edges[1], 20) * width, rng.uniform(edges[2], edges[3], 20) * width, -depth_m], axis=1
     ).astype(np.float32)
     few = point[: rng.integers(1, 20)]
     low, high = few.min(0), few.max(0)
     part = within_box(section, Aabb(*f32(*low, *high)))
     depth_m = -few[:, 2].astype(np.float64)
-    slope = few[:, :2] / (1 if parallel else depth_m)[..., None] if not parallel else few[:, :2].astype(np.float64)
+    slope = few[:, :2] / (np.ones((len(few), 1)) if parallel else depth_m[:, None])
     rounding = 3e-7 * np.abs(slope)  # the sample's own float32 may lie outside the cell
     assert (float(part.near_m) <= depth_m).all() and (depth_m <= float(part.far_m)).all()
     for k, (start, end) in enumerate(((part.left, part.right), (part.bottom, part.top))):
@@ -167,4 +168,5 @@ def test_the_distances_of_the_oracle_are_right_where_they_are_known():
     cube = oracles.cell_corners((-1, 1, -1, 1), 2.0, 4.0, parallel=True)
     points = np.array([[0, 0, -3], [3, 0, -3], [2, 2, -3], [2, 2, -1], [0, 0.5, -9]], float)
     assert np.allclose(oracles.distances_to_cell(points, cube), [0, 2, math.sqrt(2), math.sqrt(3), 5])
-    assert np.allclose(oracles.projected_interval(0, 2, 1, 0.1), [-1 / math.sqrt(3), 1 / math.sqrt(3)])
+    interval: Any = oracles.projected_interval(0, 2, 1, 0.1)
+    assert np.allclose(interval, [-1 / math.sqrt(3), 1 / math.sqrt(3)])
