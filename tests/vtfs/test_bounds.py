@@ -22,7 +22,7 @@ from vtfs.bounds import (
 )
 
 some = settings(max_examples=60, deadline=None)
-coordinates = st.floats(-1e5, 1e5, width=32)
+coordinates = st.floats(-1e5, 1e5, width=32, allow_subnormal=False)  # XLA flushes those to 0
 points = st.tuples(coordinates, coordinates, coordinates)
 lengths = st.one_of(st.just(0.0), st.floats(2**-10, 1e6, width=32))
 
