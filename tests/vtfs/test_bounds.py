@@ -22,7 +22,7 @@ from vtfs.bounds import (
 )
 
 some = settings(max_examples=60, deadline=None)
-coordinates = st.floats(-1e5, 1e5, width=32)
+coordinates = st.floats(-1e5, 1e5, width=32, allow_subnormal=False)  # XLA flushes those to 0
 points = st.tuples(coordinates, coordinates, coordinates)
 lengths = st.one_of(st.just(0.0), st.floats(2**-10, 1e6, width=32))
 
@@ -128,7 +128,7 @@ def test_the_sphere_of_a_box_holds_its_corners(corner, size):
     half_deg=st.one_of(st.sampled_from([0.5, 1.0, 45.0, 89.999, 90.0, 90.001, 179.9]), st.floats(0.5, 180)),
     apex=points,
     seed=st.integers(0, 2**32 - 1),
-    excess=st.floats(-1e-6, 1e-2),
+    excess=st.one_of(st.floats(-1e-6, 1e-2), st.floats(-0.9, -1e-4)),
 )
 @some
 def test_spheres_meet_cones_as_in_float64(half_deg, apex, seed, excess):

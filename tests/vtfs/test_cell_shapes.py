@@ -3,6 +3,7 @@
 """Spheres against the cells themselves: the exact test is that of float64 geometry, the others keep all it keeps."""
 
 import math
+from typing import Any
 
 import jax
 import numpy as np
@@ -28,7 +29,11 @@ jitted = {test: jax.jit(test) for test in TESTS}
 SLACK = 3e-6  # three times the bound of `bounds.SLACK`, relative to all magnitudes: what a test may accept besides
 
 
-def a_section(rng, parallel):
+def f32(*values: float) -> Any:
+    return [np.float32(value) for value in values]
+
+
+def a_section(rng, parallel) -> Any:
     """Edges of a tile anywhere on an image of up to 170 degrees, thin and thick slices, near 0.01 to 10 m."""
     size = 10 ** rng.uniform(-4, 1, 2)
     left, bottom = rng.normal(size=2) * 10 ** rng.uniform(-2, 1)
@@ -36,7 +41,7 @@ def a_section(rng, parallel):
     far_m = near_m * (1 + 10 ** rng.uniform(-3, 3))
     edges = tuple(float(np.float32(e)) for e in (left, left + size[0], bottom, bottom + size[1]))
     near_m, far_m, view_near_m = (float(np.float32(d)) for d in (near_m, far_m, near_m * rng.choice([1, 0.1])))
-    section = CellSections(*map(np.float32, (*edges, near_m, far_m, not parallel, view_near_m)))
+    section = CellSections(*f32(*edges, near_m, far_m, not parallel, view_near_m))
     return section, edges, near_m, far_m, view_near_m
 
 
@@ -52,7 +57,8 @@ def spheres_about(corners, rng):
 
 
 def met(test, centre, radius, section):
-    return np.asarray(jitted[test](Sphere(*centre.astype(np.float32).T, radius.astype(np.float32)), section))
+    sphere: Any = [*centre.astype(np.float32).T, radius.astype(np.float32)]
+    return np.asarray(jitted[test](Sphere(*sphere), section))
 
 
 def magnitude(centre, edges, far_m, parallel):
@@ -131,7 +137,7 @@ def test_the_screen_rectangle_is_that_of_the_tangents(seed):
 
 @pytest.mark.parametrize("test", TESTS, ids=lambda f: f.__name__)
 def test_a_light_at_infinity_meets_nothing_and_a_huge_one_everything(test):
-    section = CellSections(*map(np.float32, (-0.5, 0.0, 0.0, 0.5, 1.0, 2.0, 1, 1.0)))
+    section = CellSections(*f32(-0.5, 0.0, 0.0, 0.5, 1.0, 2.0, 1, 1.0))
     for x, radius, expected in ((np.inf, 0.0, False), (np.inf, 1e18, False), (3.0, 1e15, True), (-0.3, 0.0, True)):
         centre = np.array([[x, 0.2, -1.5]])
         assert met(test, centre, np.array([radius]), section).tolist() == [expected]
@@ -145,13 +151,13 @@ def test_a_section_within_a_box_holds_what_is_in_both(seed, parallel):
     depth_m = rng.uniform(near_m, far_m, 20)
     width = 1 if parallel else depth_m
     point = np.stack(
-        [rng.uniform(*edges[:2], 20) * width, rng.uniform(*edges[2:], 20) * width, -depth_m], axis=1
+        [rng.uniform(edges[0], edges[1], 20) * width, rng.uniform(edges[2], edges[3], 20) * width, -depth_m], axis=1
     ).astype(np.float32)
     few = point[: rng.integers(1, 20)]
     low, high = few.min(0), few.max(0)
-    part = within_box(section, Aabb(*low, *high))
+    part = within_box(section, Aabb(*f32(*low, *high)))
     depth_m = -few[:, 2].astype(np.float64)
-    slope = few[:, :2] / (1 if parallel else depth_m)[..., None] if not parallel else few[:, :2].astype(np.float64)
+    slope = few[:, :2] / (np.ones((len(few), 1)) if parallel else depth_m[:, None])
     rounding = 3e-7 * np.abs(slope)  # the sample's own float32 may lie outside the cell
     assert (float(part.near_m) <= depth_m).all() and (depth_m <= float(part.far_m)).all()
     for k, (start, end) in enumerate(((part.left, part.right), (part.bottom, part.top))):
@@ -164,4 +170,5 @@ def test_the_distances_of_the_oracle_are_right_where_they_are_known():
     cube = oracles.cell_corners((-1, 1, -1, 1), 2.0, 4.0, parallel=True)
     points = np.array([[0, 0, -3], [3, 0, -3], [2, 2, -3], [2, 2, -1], [0, 0.5, -9]], float)
     assert np.allclose(oracles.distances_to_cell(points, cube), [0, 2, math.sqrt(2), math.sqrt(3), 5])
-    assert np.allclose(oracles.projected_interval(0, 2, 1, 0.1), [-1 / math.sqrt(3), 1 / math.sqrt(3)])
+    interval: Any = oracles.projected_interval(0, 2, 1, 0.1)
+    assert np.allclose(interval, [-1 / math.sqrt(3), 1 / math.sqrt(3)])

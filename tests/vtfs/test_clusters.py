@@ -150,7 +150,7 @@ def test_bins_of_normals_split_cells(normal_cones, tile_px, normal_bins, seed):
         return np.asarray(clusters.block_cluster)[np.asarray(clusters.block_of_sample)]
 
     cell, part = (np.asarray(c.key)[of_samples(c)][valid] for c in (whole, split))
-    index = np.asarray(bin_of_normal(np.int32(normal_bins), normals))[valid]
+    index = np.asarray(bin_of_normal(np.int32(normal_bins), normals))[valid]  # type: ignore[arg-type]
     assert (part // n_bins == cell).all() and (part % n_bins == index).all()
     assert split.cones is not None
     cones = np.array([np.asarray(side) for side in jax.tree.leaves(split.cones)], np.float64)[:, of_samples(split)][

@@ -2,6 +2,8 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
 """Bins and cones of normals: each holds its normals, and no light that is in front of a surface is behind its cone."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +28,10 @@ samples_jit = jax.jit(cones_of_samples)
 face_jit = jax.jit(lambda cones, box, light: may_face(cones, sphere_of_box(box), light))
 
 
+def f32(*arrays: Any) -> Any:
+    return [np.asarray(array, np.float32) for array in arrays]
+
+
 def unit(vectors):
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
@@ -40,7 +46,7 @@ def normals_of_all_kinds(rng, n):
 
 def test_bins_are_three_by_three_on_six_faces():
     # equations.md, section 2: 3 x 3 cells on 6 faces are 54 bins.
-    assert int(bins_per_cell(np.int32(3))) == 54 and int(bins_per_cell(np.int32(0))) == 1
+    assert int(bins_per_cell(jnp.int32(3))) == 54 and int(bins_per_cell(jnp.int32(0))) == 1
     normal = normals_of_all_kinds(np.random.default_rng(0), 4096)
     found = np.asarray(bins_jit(np.int32(3), tuple(normal.T)))
     assert set(found) == set(range(54))
@@ -106,8 +112,8 @@ def test_no_light_in_front_of_a_surface_is_behind_its_cone(seed, spread, shrink)
     aside = unit(np.cross(normal, rng.normal(size=(n, 3)))) * size * 10 ** rng.uniform(-1, 3, (n, 1))
     light = sample + aside + normal * np.linalg.norm(aside, axis=1, keepdims=True) * 10**shrink
     in_front = ((light.astype(np.float32) - sample) * normal).sum(1) > 0
-    cones = NormalCones(*axis.astype(np.float32).T, cos.astype(np.float32))
-    faces = face_jit(cones, Aabb(*low.T, *high.T), Sphere(*light.astype(np.float32).T, np.ones(n, np.float32)))
+    cones = NormalCones(*f32(*axis.T, cos))
+    faces = face_jit(cones, Aabb(*f32(*low.T, *high.T)), Sphere(*f32(*light.T, np.ones(n))))
     assert np.asarray(faces)[in_front].all()
 
 
@@ -115,9 +121,9 @@ def test_lights_behind_all_surfaces_are_culled_as_in_the_equation():
     """omega > pi/2 + alpha + delta (Olsson et al. 2012, Sec. 3.3), with a sphere of radius 1 seen from 10 m."""
     alpha, delta = np.radians(20.0), np.arcsin(0.1)
     corner = 1 / np.sqrt(3)
-    box = Aabb(*(np.full(1, v, np.float32) for v in (-corner,) * 3 + (corner,) * 3))
-    cones = NormalCones(*(np.full(1, v, np.float32) for v in (0, 0, 1, np.cos(alpha))))
+    box = Aabb(*f32(*[[-corner]] * 3, *[[corner]] * 3))
+    cones = NormalCones(*f32([0], [0], [1], [np.cos(alpha)]))
     for off, expected in ((-0.001, True), (0.001, False)):
         omega = np.pi / 2 + alpha + delta + off
-        light = [np.full(1, v, np.float32) for v in (10 * np.sin(omega), 0, 10 * np.cos(omega), 5)]
+        light = f32([10 * np.sin(omega)], [0], [10 * np.cos(omega)], [5])
         assert bool(face_jit(cones, box, Sphere(*light))[0]) == expected

@@ -121,9 +121,8 @@ def _command() -> str:
 
 def _recommendation(result: dict[str, Any]) -> str:
     best, gain = result["best"], result["gain"]
-    changed = [
-        f"{name}={value}" for name, value in best["params"].items() if value != default_value(best["technique"], name)
-    ]
+    technique, params = best["technique"], best["params"]
+    changed = [f"{name}={value}" for name, value in params.items() if value != default_value(technique, name)]
     low, high = best["time_ms_interval"]
     lines = [f"{' '.join([best['technique'], *changed])}: {best['time_ms']:.1f} ms a frame ({low:.1f} to {high:.1f})"]
     for role, words in (("default", "its default"), ("fastest_default", "the fastest default")):
