@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tuning.bootstrap import bootstrap_costs
 from tuning.family import candidate_terms
 from tuning.law import Law
 from tuning.overlap import best_overlaps
-from tuning.robust_fit import MOST_COSTS, Problems, solve
+from tuning.robust_fit import MOST_COSTS, Problems, influence, solve
 from tuning.subsets import Problem, Scored, Selection, select_subset
 from tuning.terms import CONSTANT, Term
-from tuning.time_model import LeftOut, PlausibleLaw, TimeModel
+from tuning.time_model import COVERAGE, Influence, LeftOut, PlausibleLaw, TimeModel
 
 MOST_TERMS = 4
 _MOST_PLAUSIBLE = 8
@@ -23,6 +24,8 @@ _STARTS = 8
 _FEWEST_ROWS = 4
 _HUBER = 1.5
 _CHI2_90 = 2.71
+_REFITS = 256
+_MOST_INFLUENTIAL = 3
 _NOISE_FLOOR = 0.005
 """Relative: clocks and rounding leave no time better known than this."""
 
@@ -74,6 +77,9 @@ def fit_law(
     plausible = [chosen, *alike[: _MOST_PLAUSIBLE - 1]]
     weights = np.exp(-(np.array([one.merit for one in plausible]) - min(one.merit for one in plausible)))
     laws = _with_error_bars(problem, columns, [one.law for one in plausible], weights / weights.sum(), delta)
+    best_law = laws[0].law
+    resampled = bootstrap_costs(best_law, columns, repeats_ms, problem.weights, delta, _REFITS, seed)
+    ends = np.quantile(resampled, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2], axis=0)
     constant = next((one.error for one in found if one.size == 0), math.inf)
     return TimeModel(
         laws=laws,
@@ -88,6 +94,8 @@ def fit_law(
         },
         left_out=_left_out(every, selection, chosen.law),
         messages=tuple(messages),
+        cost_intervals_ms=tuple((float(low), float(high)) for low, high in ends.T),
+        influential=_influential(problem, columns, best_law, delta),
     )
 
 
@@ -142,6 +150,24 @@ def _left_out(every: Sequence[Term], selection: Selection, law: Law) -> tuple[Le
         if len(terms) == len(taken) + 1 and terms > taken:
             errors.setdefault(next(iter(terms - taken)).name, one.error)
     return tuple(LeftOut(term, error) for term, error in sorted(errors.items(), key=lambda item: item[1]))
+
+
+def _influential(problem: Problem, columns: Mapping[str, np.ndarray], law: Law, delta: float) -> tuple[Influence, ...]:
+    design = law.design(columns)
+    scale = (design / problem.times_ms[:, None]).max(axis=0)
+    at_optimum = Problems(
+        (design / scale)[None],
+        np.array(law.sides)[None],
+        np.log(problem.times_ms)[None],
+        problem.weights[None],
+        np.log(np.array(law.costs_ms) * scale)[None],
+        delta,
+    )
+    moved = np.sqrt(np.mean((law.slopes(columns) @ influence(at_optimum)) ** 2, axis=0))
+    return tuple(
+        Influence({name: float(column[row]) for name, column in columns.items() if name}, float(moved[row]))
+        for row in np.argsort(-moved, kind="stable")[:_MOST_INFLUENTIAL]
+    )
 
 
 def _with_error_bars(

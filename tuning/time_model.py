@@ -54,6 +54,19 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
+class Influence:
+    """A fitted row that moves predictions.
+
+    - `columns`: which row it is.
+    - `slope`: a time of that row 1 % longer makes the times of all fitted rows this many per cent longer, root of the
+      mean of squares.
+    """
+
+    columns: dict[str, float]
+    slope: float
+
+
+@dataclass(frozen=True)
 class TimeModel:
     """The times of one technique and stage.
 
@@ -64,6 +77,8 @@ class TimeModel:
     - `hull`: the columns that the law depends on, float64 `[points]` each: what it was fitted to.
     - `ranges`: least and most of the other columns it was fitted to: beyond them they may matter after all.
     - `left_out`, `messages`: what was not taken, and what could not be told apart.
+    - `cost_intervals_ms`: 90 % intervals of the costs of the chosen law, by bootstrap.
+    - `influential`: the rows that move predictions most.
     """
 
     laws: tuple[PlausibleLaw, ...]
@@ -74,6 +89,8 @@ class TimeModel:
     ranges: dict[str, tuple[float, float]]
     left_out: tuple[LeftOut, ...]
     messages: tuple[str, ...]
+    cost_intervals_ms: tuple[tuple[float, float], ...] = ()
+    influential: tuple[Influence, ...] = ()
 
     @property
     def law(self) -> Law:
@@ -174,6 +191,8 @@ class TimeModel:
             "ranges": {name: list(ends) for name, ends in self.ranges.items()},
             "left_out": [{"term": one.term, "error": _finite(one.error)} for one in self.left_out],
             "messages": list(self.messages),
+            "cost_intervals_ms": [list(ends) for ends in self.cost_intervals_ms],
+            "influential": [{"columns": row.columns, "slope": row.slope} for row in self.influential],
         }
 
     @classmethod
@@ -193,6 +212,8 @@ class TimeModel:
             {name: (float(low), float(high)) for name, (low, high) in entry["ranges"].items()},  # type: ignore[union-attr]
             tuple(LeftOut(one["term"], _or_infinite(one["error"])) for one in entry["left_out"]),  # type: ignore[union-attr]
             tuple(entry["messages"]),  # type: ignore[arg-type]
+            tuple((float(low), float(high)) for low, high in entry["cost_intervals_ms"]),  # type: ignore[union-attr]
+            tuple(Influence(dict(row["columns"]), float(row["slope"])) for row in entry["influential"]),  # type: ignore[union-attr]
         )
 
 

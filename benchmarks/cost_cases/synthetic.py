@@ -47,8 +47,8 @@ def draws(n: int) -> Iterator[Draw]:
     makers = (_constant, _linear, _n_log_n, _root, _tile, _two, _product, _larger, _capacity)
     for k in range(n):
         rng = np.random.default_rng(k)
-        x = np.exp(rng.uniform(*np.log(X), ROWS))
-        y = np.exp(rng.uniform(*np.log(Y), ROWS))
+        x = np.exp(rng.uniform(np.log(X[0]), np.log(X[1]), ROWS))
+        y = np.exp(rng.uniform(np.log(Y[0]), np.log(Y[1]), ROWS))
         shape, names, law, terms = makers[k % len(makers)](rng)
         columns = {name: column for name, column in (("x", x), ("y", y)) if name in names}
         times_ms = law(columns) * np.exp(NOISE * rng.normal(size=ROWS))
