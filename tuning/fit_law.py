@@ -15,7 +15,7 @@ from tuning.overlap import best_overlaps
 from tuning.robust_fit import MOST_COSTS, Problems, influence, solve
 from tuning.subsets import Problem, Scored, Selection, select_subset
 from tuning.terms import CONSTANT, Term
-from tuning.time_model import COVERAGE, Influence, LeftOut, PlausibleLaw, TimeModel
+from tuning.time_model import COVERAGE, Influence, LeftOut, PlausibleLaw, TimeModel, stretched
 
 MOST_TERMS = 4
 _MOST_PLAUSIBLE = 8
@@ -25,6 +25,7 @@ _FEWEST_ROWS = 4
 _HUBER = 1.5
 _CHI2_90 = 2.71
 _REFITS = 256
+_DIRECTIONS = 512
 _MOST_INFLUENTIAL = 3
 _NOISE_FLOOR = 0.005
 """Relative: clocks and rounding leave no time better known than this."""
@@ -86,7 +87,7 @@ def fit_law(
         n_rows=n_rows,
         error=chosen.error if n_rows > 1 else math.inf,
         constant_error=constant if n_rows > 1 else math.inf,
-        hull={name: np.asarray(columns[name], float) for name in laws[0].law.columns},
+        hull=_hull({name: columns[name] for name in laws[0].law.columns}),
         ranges={
             name: (float(column.min()), float(column.max()))
             for name, column in columns.items()
@@ -150,6 +151,17 @@ def _left_out(every: Sequence[Term], selection: Selection, law: Law) -> tuple[Le
         if len(terms) == len(taken) + 1 and terms > taken:
             errors.setdefault(next(iter(terms - taken)).name, one.error)
     return tuple(LeftOut(term, error) for term, error in sorted(errors.items(), key=lambda item: item[1]))
+
+
+def _hull(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Rows whose convex hull is that of all, or hardly smaller: the furthest in many directions."""
+    if not columns:
+        return {}
+    points = np.stack([stretched(column, column) for column in columns.values()], axis=1)
+    directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, len(columns)))
+    directions = np.vstack([directions, np.eye(len(columns)), -np.eye(len(columns))])
+    furthest = np.unique((points @ directions.T).argmax(axis=0))
+    return {name: np.asarray(column, float)[furthest] for name, column in columns.items()}
 
 
 def _influential(problem: Problem, columns: Mapping[str, np.ndarray], law: Law, delta: float) -> tuple[Influence, ...]:

@@ -147,18 +147,18 @@ class TimeModel:
         squared = np.zeros(len(next(iter(columns.values()))))
         for name, ends in self.ranges.items():
             if name in columns:
-                least, most, x = (_stretched(np.asarray(v, float), np.array(ends)) for v in (*ends, columns[name]))
+                least, most, x = (stretched(np.asarray(v, float), np.array(ends)) for v in (*ends, columns[name]))
                 squared += np.maximum(np.maximum(x - most, least - x), 0) ** 2
         if self.hull:
-            points = np.stack([_stretched(self.hull[name], self.hull[name]) for name in self.hull], axis=1)
-            asked = np.stack([_stretched(np.asarray(columns[n], float), self.hull[n]) for n in self.hull], axis=1)
+            points = np.stack([stretched(self.hull[name], self.hull[name]) for name in self.hull], axis=1)
+            asked = np.stack([stretched(np.asarray(columns[n], float), self.hull[n]) for n in self.hull], axis=1)
             # A convex combination: non-negative weights that add up to 1, the last row made too stiff to bend.
             stiff = 1e3 * (1 + np.abs(points).max())
             corners = np.vstack([points.T, np.full(len(points), stiff)])
             for row, point in enumerate(asked):
                 if ((point >= points.min(axis=0)) & (point <= points.max(axis=0))).all() and len(self.hull) == 1:
                     continue
-                weights, _ = nnls(corners, np.append(point, stiff))
+                weights, _ = nnls(corners, np.append(point, stiff), maxiter=100 * len(points))
                 squared[row] += np.sum((points.T @ weights / max(weights.sum(), 1e-12) - point) ** 2)
         return np.where(squared > 1e-10, np.sqrt(squared), 0.0)
 
@@ -217,7 +217,7 @@ class TimeModel:
         )
 
 
-def _stretched(x: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+def stretched(x: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """Logarithms above the smallest size that was fitted, linear below it: sizes may be 0."""
     positive = fitted[fitted > 0]
     least = float(positive.min()) if len(positive) else 1.0
