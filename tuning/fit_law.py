@@ -23,6 +23,7 @@ _MOST_WORSE = 4.0  # nats: what is less likely than that is no longer plausible
 _STARTS = 8
 _FEWEST_ROWS = 4
 _HUBER = 1.5
+_SOFTENED = 0.700  # mean of z^2 / sqrt(1 + (z / _HUBER)^2) for a normal z: what softening leaves of the variance
 _CHI2_90 = 2.71
 _REFITS = 256
 _DIRECTIONS = 512
@@ -193,7 +194,7 @@ def _with_error_bars(
         residual = np.log(problem.times_ms / law.predict(columns))
         softened = problem.weights / np.sqrt(1 + (residual / delta) ** 2)
         degrees = max(len(residual) - len(law.terms), 1)
-        spread = max(math.sqrt(float(np.sum(softened * residual**2)) / degrees), _NOISE_FLOOR)
+        spread = max(math.sqrt(float(np.sum(softened * residual**2)) / degrees / _SOFTENED), _NOISE_FLOOR)
         covariance = np.linalg.pinv(slopes.T @ (softened[:, None] * slopes), hermitian=True) * spread**2
         found.append(PlausibleLaw(law, float(weight), covariance, spread))
     return tuple(found)
