@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tuning.bootstrap import bootstrap_costs
 from tuning.family import candidate_terms
 from tuning.law import Law
 from tuning.overlap import best_overlaps
-from tuning.robust_fit import MOST_COSTS, Problems, solve
+from tuning.robust_fit import MOST_COSTS, Problems, influence, solve
 from tuning.subsets import Problem, Scored, Selection, select_subset
 from tuning.terms import CONSTANT, Term
-from tuning.time_model import LeftOut, PlausibleLaw, TimeModel
+from tuning.time_model import COVERAGE, Influence, LeftOut, PlausibleLaw, TimeModel, stretched
 
 MOST_TERMS = 4
 _MOST_PLAUSIBLE = 8
@@ -22,7 +23,11 @@ _MOST_WORSE = 4.0  # nats: what is less likely than that is no longer plausible
 _STARTS = 8
 _FEWEST_ROWS = 4
 _HUBER = 1.5
+_SOFTENED = 0.700  # mean of z^2 / sqrt(1 + (z / _HUBER)^2) for a normal z: what softening leaves of the variance
 _CHI2_90 = 2.71
+_REFITS = 256
+_DIRECTIONS = 512
+_MOST_INFLUENTIAL = 3
 _NOISE_FLOOR = 0.005
 """Relative: clocks and rounding leave no time better known than this."""
 
@@ -74,13 +79,16 @@ def fit_law(
     plausible = [chosen, *alike[: _MOST_PLAUSIBLE - 1]]
     weights = np.exp(-(np.array([one.merit for one in plausible]) - min(one.merit for one in plausible)))
     laws = _with_error_bars(problem, columns, [one.law for one in plausible], weights / weights.sum(), delta)
+    best_law = laws[0].law
+    resampled = bootstrap_costs(best_law, columns, repeats_ms, problem.weights, delta, _REFITS, seed)
+    ends = np.quantile(resampled, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2], axis=0)
     constant = next((one.error for one in found if one.size == 0), math.inf)
     return TimeModel(
         laws=laws,
         n_rows=n_rows,
         error=chosen.error if n_rows > 1 else math.inf,
         constant_error=constant if n_rows > 1 else math.inf,
-        hull={name: np.asarray(columns[name], float) for name in laws[0].law.columns},
+        hull=_hull({name: columns[name] for name in laws[0].law.columns}),
         ranges={
             name: (float(column.min()), float(column.max()))
             for name, column in columns.items()
@@ -88,6 +96,8 @@ def fit_law(
         },
         left_out=_left_out(every, selection, chosen.law),
         messages=tuple(messages),
+        cost_intervals_ms=tuple((float(low), float(high)) for low, high in ends.T),
+        influential=_influential(problem, columns, best_law, delta),
     )
 
 
@@ -144,6 +154,35 @@ def _left_out(every: Sequence[Term], selection: Selection, law: Law) -> tuple[Le
     return tuple(LeftOut(term, error) for term, error in sorted(errors.items(), key=lambda item: item[1]))
 
 
+def _hull(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Rows whose convex hull is that of all, or hardly smaller: the furthest in many directions."""
+    if not columns:
+        return {}
+    points = np.stack([stretched(column, column) for column in columns.values()], axis=1)
+    directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, len(columns)))
+    directions = np.vstack([directions, np.eye(len(columns)), -np.eye(len(columns))])
+    furthest = np.unique((points @ directions.T).argmax(axis=0))
+    return {name: np.asarray(column, float)[furthest] for name, column in columns.items()}
+
+
+def _influential(problem: Problem, columns: Mapping[str, np.ndarray], law: Law, delta: float) -> tuple[Influence, ...]:
+    design = law.design(columns)
+    scale = (design / problem.times_ms[:, None]).max(axis=0)
+    at_optimum = Problems(
+        (design / scale)[None],
+        np.array(law.sides)[None],
+        np.log(problem.times_ms)[None],
+        problem.weights[None],
+        np.log(np.array(law.costs_ms) * scale)[None],
+        delta,
+    )
+    moved = np.sqrt(np.mean((law.slopes(columns) @ influence(at_optimum)) ** 2, axis=0))
+    return tuple(
+        Influence({name: float(column[row]) for name, column in columns.items() if name}, float(moved[row]))
+        for row in np.argsort(-moved, kind="stable")[:_MOST_INFLUENTIAL]
+    )
+
+
 def _with_error_bars(
     problem: Problem, columns: Mapping[str, np.ndarray], laws: Sequence[Law], weights: np.ndarray, delta: float
 ) -> tuple[PlausibleLaw, ...]:
@@ -155,7 +194,7 @@ def _with_error_bars(
         residual = np.log(problem.times_ms / law.predict(columns))
         softened = problem.weights / np.sqrt(1 + (residual / delta) ** 2)
         degrees = max(len(residual) - len(law.terms), 1)
-        spread = max(math.sqrt(float(np.sum(softened * residual**2)) / degrees), _NOISE_FLOOR)
+        spread = max(math.sqrt(float(np.sum(softened * residual**2)) / degrees / _SOFTENED), _NOISE_FLOOR)
         covariance = np.linalg.pinv(slopes.T @ (softened[:, None] * slopes), hermitian=True) * spread**2
         found.append(PlausibleLaw(law, float(weight), covariance, spread))
     return tuple(found)

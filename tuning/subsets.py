@@ -13,6 +13,7 @@ import numpy as np
 
 _SCORED = 200  # sets of a size that are fitted robustly, those with the smallest plain residual
 _SCORED_IN_A_FOLD = 30
+_MOST_NUMBERS = 400_000  # rows times sets at once: they are copied a few times, for each term
 _BEAM = 30  # sets of a size that are grown
 _FEW_TERMS = 60
 _MOST_PAIRS = 120_000
@@ -69,6 +70,7 @@ class Problem:
 def score_subsets(problem: Problem, most_terms: int, most_scored: int = _SCORED) -> list[Scored]:
     """The best sets of up to `most_terms` terms beside the constant, best first within each size, smallest first."""
     n_rows, n_terms = problem.columns.shape
+    most_scored = min(most_scored, max(_MOST_NUMBERS // n_rows, _BEAM))
     scale = (problem.columns / problem.times_ms[:, None]).max(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     scaled = problem.columns / scale

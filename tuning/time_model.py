@@ -54,6 +54,19 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
+class Influence:
+    """A fitted row that moves predictions.
+
+    - `columns`: which row it is.
+    - `slope`: a time of that row 1 % longer makes the times of all fitted rows this many per cent longer, root of the
+      mean of squares.
+    """
+
+    columns: dict[str, float]
+    slope: float
+
+
+@dataclass(frozen=True)
 class TimeModel:
     """The times of one technique and stage.
 
@@ -64,6 +77,8 @@ class TimeModel:
     - `hull`: the columns that the law depends on, float64 `[points]` each: what it was fitted to.
     - `ranges`: least and most of the other columns it was fitted to: beyond them they may matter after all.
     - `left_out`, `messages`: what was not taken, and what could not be told apart.
+    - `cost_intervals_ms`: 90 % intervals of the costs of the chosen law, by bootstrap.
+    - `influential`: the rows that move predictions most.
     """
 
     laws: tuple[PlausibleLaw, ...]
@@ -74,6 +89,8 @@ class TimeModel:
     ranges: dict[str, tuple[float, float]]
     left_out: tuple[LeftOut, ...]
     messages: tuple[str, ...]
+    cost_intervals_ms: tuple[tuple[float, float], ...] = ()
+    influential: tuple[Influence, ...] = ()
 
     @property
     def law(self) -> Law:
@@ -130,18 +147,18 @@ class TimeModel:
         squared = np.zeros(len(next(iter(columns.values()))))
         for name, ends in self.ranges.items():
             if name in columns:
-                least, most, x = (_stretched(np.asarray(v, float), np.array(ends)) for v in (*ends, columns[name]))
+                least, most, x = (stretched(np.asarray(v, float), np.array(ends)) for v in (*ends, columns[name]))
                 squared += np.maximum(np.maximum(x - most, least - x), 0) ** 2
         if self.hull:
-            points = np.stack([_stretched(self.hull[name], self.hull[name]) for name in self.hull], axis=1)
-            asked = np.stack([_stretched(np.asarray(columns[n], float), self.hull[n]) for n in self.hull], axis=1)
+            points = np.stack([stretched(self.hull[name], self.hull[name]) for name in self.hull], axis=1)
+            asked = np.stack([stretched(np.asarray(columns[n], float), self.hull[n]) for n in self.hull], axis=1)
             # A convex combination: non-negative weights that add up to 1, the last row made too stiff to bend.
             stiff = 1e3 * (1 + np.abs(points).max())
             corners = np.vstack([points.T, np.full(len(points), stiff)])
             for row, point in enumerate(asked):
                 if ((point >= points.min(axis=0)) & (point <= points.max(axis=0))).all() and len(self.hull) == 1:
                     continue
-                weights, _ = nnls(corners, np.append(point, stiff))
+                weights, _ = nnls(corners, np.append(point, stiff), maxiter=100 * len(points))
                 squared[row] += np.sum((points.T @ weights / max(weights.sum(), 1e-12) - point) ** 2)
         return np.where(squared > 1e-10, np.sqrt(squared), 0.0)
 
@@ -174,6 +191,8 @@ class TimeModel:
             "ranges": {name: list(ends) for name, ends in self.ranges.items()},
             "left_out": [{"term": one.term, "error": _finite(one.error)} for one in self.left_out],
             "messages": list(self.messages),
+            "cost_intervals_ms": [list(ends) for ends in self.cost_intervals_ms],
+            "influential": [{"columns": row.columns, "slope": row.slope} for row in self.influential],
         }
 
     @classmethod
@@ -193,10 +212,12 @@ class TimeModel:
             {name: (float(low), float(high)) for name, (low, high) in entry["ranges"].items()},  # type: ignore[union-attr]
             tuple(LeftOut(one["term"], _or_infinite(one["error"])) for one in entry["left_out"]),  # type: ignore[union-attr]
             tuple(entry["messages"]),  # type: ignore[arg-type]
+            tuple((float(low), float(high)) for low, high in entry["cost_intervals_ms"]),  # type: ignore[union-attr]
+            tuple(Influence(dict(row["columns"]), float(row["slope"])) for row in entry["influential"]),  # type: ignore[union-attr]
         )
 
 
-def _stretched(x: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+def stretched(x: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """Logarithms above the smallest size that was fitted, linear below it: sizes may be 0."""
     positive = fitted[fitted > 0]
     least = float(positive.min()) if len(positive) else 1.0

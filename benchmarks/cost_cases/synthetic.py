@@ -24,7 +24,7 @@ Columns = Mapping[str, np.ndarray]
 class Draw:
     """A law with drawn costs, and its rows.
 
-    - `terms`: the names that are right; a cut is right at any knot within a factor of two.
+    - `terms`: the names that are right; a cut is right at any knot.
     """
 
     shape: str
@@ -43,13 +43,13 @@ class Draw:
 
 
 def draws(n: int) -> Iterator[Draw]:
-    """In turns of nine shapes. Every term is a fifth of the time or more where it is largest."""
+    """In turns of nine shapes. Every term is at least half of the time in some row: else it could not be found."""
     makers = (_constant, _linear, _n_log_n, _root, _tile, _two, _product, _larger, _capacity)
     for k in range(n):
         rng = np.random.default_rng(k)
-        x = np.exp(rng.uniform(*np.log(X), ROWS))
-        y = np.exp(rng.uniform(*np.log(Y), ROWS))
-        shape, names, law, terms = makers[k % len(makers)](rng)
+        x = np.exp(rng.uniform(np.log(X[0]), np.log(X[1]), ROWS))
+        y = np.exp(rng.uniform(np.log(Y[0]), np.log(Y[1]), ROWS))
+        shape, names, law, terms = makers[k % len(makers)](rng, x, y)
         columns = {name: column for name, column in (("x", x), ("y", y)) if name in names}
         times_ms = law(columns) * np.exp(NOISE * rng.normal(size=ROWS))
         yield Draw(shape, law, frozenset(terms), columns, times_ms)
@@ -94,7 +94,9 @@ def rows(n: int, peers: Peers) -> Iterator[tuple[str, str, str]]:
         ours = np.array([m.predict(d.beyond(factor), {})[0].time_ms for m, d in zip(models, drawn, strict=True)])
         yield f"median error at {factor:g} times the data", f"{_median(ours, truth):.1%}", f"at most {target:.0%}"
         for name, values in predicted.items():
-            yield f"  {name}", f"{_median(np.array([v[k] for v in values]), truth):.1%}", ""
+            theirs = np.array([v[k] for v in values])
+            known = np.isfinite(theirs)
+            yield f"  {name}", f"{_median(theirs[known], truth[known]):.1%} of {known.sum()} laws", ""
     yield from _coverage(models, drawn)
 
 
@@ -150,52 +152,55 @@ _Law = tuple[str, tuple[str, ...], Callable[[Columns], np.ndarray], tuple[str, .
 
 
 def _share(rng: np.random.Generator, most: float = 20.0) -> float:
-    """A term at its largest, over the constant: from a quarter to `most` times."""
-    return float(np.exp(rng.uniform(np.log(0.25), np.log(most))))
+    """A term where it is largest, over the constant."""
+    return float(np.exp(rng.uniform(np.log(1.5), np.log(most))))
 
 
-def _constant(rng: np.random.Generator) -> _Law:
+def _constant(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> _Law:
     a = rng.uniform(0.5, 5)
     return "constant", ("x", "y"), lambda c: np.full(len(c["x"]), a), ()
 
 
-def _linear(rng: np.random.Generator) -> _Law:
-    a, b = rng.uniform(0.5, 5), _share(rng) / X[1]
+def _linear(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> _Law:
+    a, b = rng.uniform(0.5, 5), _share(rng) / x.max()
     return "a + b x", ("x",), lambda c: a * (1 + b * c["x"]), ("x",)
 
 
-def _n_log_n(rng: np.random.Generator) -> _Law:
-    a, b = rng.uniform(0.5, 5), _share(rng) / (X[1] * np.log2(X[1]))
+def _n_log_n(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> _Law:
+    a, b = rng.uniform(0.5, 5), _share(rng) / (x * np.log2(x)).max()
     return "a + b x log x", ("x",), lambda c: a * (1 + b * c["x"] * np.log2(c["x"])), ("x * log2(x)",)
 
 
-def _root(rng: np.random.Generator) -> _Law:
-    a, b = rng.uniform(0.5, 5), _share(rng) / X[1] ** 0.5
+def _root(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> _Law:
+    a, b = rng.uniform(0.5, 5), _share(rng) / np.sqrt(x.max())
     return "a + b sqrt x", ("x",), lambda c: a * (1 + b * np.sqrt(c["x"])), ("x^0.5",)
 
 
-def _tile(rng: np.random.Generator) -> _Law:
-    a, b, c_ = rng.uniform(0.2, 1), _share(rng) * Y[0], _share(rng) / Y[1]
+def _tile(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> _Law:
+    a, b, c_ = rng.uniform(0.2, 1), _share(rng) * y.min(), _share(rng) / y.max()
     return "a + b / y + c y", ("y",), lambda c: a * (1 + b / c["y"] + c_ * c["y"]), ("y", "y^-1")
 
 
-def _two(rng: np.random.Generator) -> _Law:
-    a, b, c_ = rng.uniform(0.5, 5), _share(rng) / X[1], _share(rng) / Y[1]
+def _two(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> _Law:
+    a, b, c_ = rng.uniform(0.5, 5), _share(rng) / x.max(), _share(rng) / y.max()
     return "a + b x + c y", ("x", "y"), lambda c: a * (1 + b * c["x"] + c_ * c["y"]), ("x", "y")
 
 
-def _product(rng: np.random.Generator) -> _Law:
-    a, b = rng.uniform(0.5, 5), _share(rng) / (X[1] * Y[1])
+def _product(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> _Law:
+    a, b = rng.uniform(0.5, 5), _share(rng) / (x * y).max()
     return "a + b x y", ("x", "y"), lambda c: a * (1 + b * c["x"] * c["y"]), ("x * y",)
 
 
-def _larger(rng: np.random.Generator) -> _Law:
-    a, b = rng.uniform(2, 20) / X[1], rng.uniform(2, 20) / Y[1]
+def _larger(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> _Law:
+    # Each is the larger one in a quarter of the rows or more.
+    a, b = 1.0, float(np.exp(np.quantile(np.log(x / y), rng.uniform(0.25, 0.75))))
     terms = ("larger of x", "larger of y")
-    return "max(a x, b y)", ("x", "y"), lambda c: np.maximum(a * c["x"], b * c["y"]), terms
+    return "max(a x, b y)", ("x", "y"), lambda c: 1e-3 * np.maximum(a * c["x"], b * c["y"]), terms
 
 
-def _capacity(rng: np.random.Generator) -> _Law:
-    a, b, k = rng.uniform(0.5, 5), _share(rng), np.exp(rng.uniform(np.log(30), np.log(1000)))
+def _capacity(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> _Law:
+    # Between half and three in ten of the rows are beyond it; a cut near the end of the rows is no more than a line.
+    a, b, k = rng.uniform(0.5, 5), _share(rng), float(np.quantile(x, rng.uniform(0.5, 0.7)))
+    slope = b / (x.max() - k)
     law = ("beyond x",)
-    return "a + b max(x - k, 0)", ("x",), lambda c: a * (1 + b / X[1] * np.maximum(c["x"] - k, 0)), law
+    return "a + b max(x - k, 0)", ("x",), lambda c: a * (1 + slope * np.maximum(c["x"] - k, 0)), law

@@ -90,6 +90,18 @@ def test_a_constant_without_columns():
     assert predicted.low_ms <= 1.05 <= predicted.high_ms
 
 
+def test_costs_have_intervals_and_rows_an_influence():
+    x = np.append(np.geomspace(10, 100, 14), 1e5)
+    times_ms = noisy(1 + 1e-3 * x, seed=6)
+    one = only(fit_table(table({"x": x}, times_ms)))
+    true = {"1": 1.0, "x": 1e-3}
+    for term, (low, high) in zip(one.law.terms, one.cost_intervals_ms, strict=True):
+        assert 0.8 * true[term.name] < low < true[term.name] < high < 1.25 * true[term.name]  # 3 % noise
+    # The slope hangs on the one row far out.
+    assert one.influential[0].columns == {"x": 1e5}
+    assert one.influential[0].slope > one.influential[1].slope
+
+
 def test_json_is_a_round_trip_and_has_no_infinity():
     x = np.tile(sizes(12, seed=4), 2)
     labels = {"technique": ("forward",) * 12 + ("tiled",) * 12}

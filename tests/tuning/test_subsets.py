@@ -1,0 +1,90 @@
+"""Sets of terms against an obvious search with SciPy, and the left-out residuals against refits."""
+
+import itertools
+
+import numpy as np
+import pytest
+import scipy.optimize
+from numpy.testing import assert_allclose
+
+from tuning.subsets import Problem, score_subsets, select_subset
+
+
+def problem(seed, n_terms=7, n_rows=24, noise=0.03, true=(2, 5)):
+    rng = np.random.default_rng(seed)
+    columns = np.exp(rng.uniform(0, 7, (n_rows, n_terms + 1)))
+    columns[:, 0] = 1.0
+    times_ms = 5.0 + columns[:, list(true)] @ np.full(len(true), 0.05)
+    times_ms = times_ms * np.exp(noise * rng.normal(size=n_rows))
+    sizes = np.ones(n_terms + 1, int)
+    sizes[0] = 0
+    return Problem(columns, times_ms, np.ones(n_rows), sizes, np.zeros(n_terms + 1))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_best_pair_is_that_of_an_exhaustive_search(seed):
+    given = problem(seed)
+    best = min(
+        itertools.combinations(range(1, 8), 2),
+        key=lambda pair: scipy.optimize.nnls(
+            given.columns[:, [0, *pair]] / given.times_ms[:, None], np.ones(len(given.times_ms))
+        )[1],
+    )
+    found = next(one for one in score_subsets(given, 3) if one.size == 2)
+    assert found.support[-2:] == best == (2, 5)
+    # 24 rows of 3 % noise; a cost is half of the time in most rows.
+    assert_allclose(found.costs[-2:], 0.05, rtol=0.08)
+
+
+def test_left_out_residuals_are_those_of_refits_without_the_row():
+    given = problem(0, true=(2,))
+    found = next(one for one in score_subsets(given, 1) if one.support == (0, 2))
+
+    def loss(logs, keep):
+        predicted = np.exp(logs[0]) + np.exp(logs[1]) * given.columns[keep, 2]
+        return np.sum(np.log(given.times_ms[keep] / predicted) ** 2)
+
+    for row in (0, 11, 23):
+        keep = np.arange(24) != row
+        logs = scipy.optimize.minimize(loss, np.log(found.costs), (keep,), method="Nelder-Mead").x
+        predicted = np.exp(logs[0]) + np.exp(logs[1]) * given.columns[row, 2]
+        # The formula keeps the robust weights and the slopes of the fit to all rows.
+        assert found.left_out[row] == pytest.approx(np.log(given.times_ms[row] / predicted), abs=0.01)
+
+
+def test_a_size_is_judged_with_the_selection_inside():
+    # 30 columns of noise: the best of 435 pairs looks better than a constant; it is not.
+    constants = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        columns = np.exp(rng.uniform(0, 7, (20, 31)))
+        columns[:, 0] = 1.0
+        sizes = np.ones(31, int)
+        sizes[0] = 0
+        given = Problem(columns, np.exp(0.1 * rng.normal(size=20)), np.ones(20), sizes, np.zeros(31))
+        selection = select_subset(given, 2)
+        constants += selection.chosen.support == (0,)
+        assert selection.path[-1].error < selection.path[0].error  # what a selection outside the folds would have said
+    # A useless term has to beat a constant by a standard error: one in six by chance, at most.
+    assert constants >= 5
+
+
+def test_of_terms_that_fit_alike_the_plainer_is_taken():
+    given = problem(1, true=(2,))
+    columns = given.columns.copy()
+    columns[:, 1] = columns[:, 2] * np.exp(0.001 * np.random.default_rng(0).normal(size=24))
+    for plain, other in ((1, 2), (2, 1)):
+        surprise = np.zeros(8)
+        surprise[other] = 1.0
+        alike = Problem(columns, given.times_ms, given.weights, given.sizes, surprise)
+        assert select_subset(alike, 2).chosen.support == (0, plain)
+
+
+def test_an_outlier_does_not_move_the_costs():
+    given = problem(3)
+    times_ms = given.times_ms.copy()
+    times_ms[4] *= 3
+    found = select_subset(Problem(given.columns, times_ms, given.weights, given.sizes, given.surprise), 3).chosen
+    assert {2, 5} <= set(found.support)
+    costs = dict(zip(found.support, found.costs, strict=True))
+    assert_allclose([costs[2], costs[5]], 0.05, rtol=0.1)
