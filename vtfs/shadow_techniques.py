@@ -115,7 +115,7 @@ def fitted(technique: str, plan: ShadowPlan, frame: ShadowFrame, unrolled: bool 
     plan = replace(
         plan,
         clusters=plan.clusters or _rounded_up("clusters", n_samples // 8, _FIRST.clusters),
-        groups=plan.groups or _rounded_up("lists", frame.triangles.shape[0], _FIRST.groups),
+        groups=plan.groups or _rounded_up("lists", 2 * frame.triangles.shape[0], _FIRST.groups),
         leaf_groups=plan.leaf_groups or _rounded_up("leaf lists", n_samples // 8, _FIRST.leaf_groups),
         level_groups=(),
     )

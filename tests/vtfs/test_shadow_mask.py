@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from tests.strategies import SMALL, a_camera, seeds, surface_samples
 from vtfs.camera import Camera, Viewport, load_cameras
 from vtfs.gallery import build_scene
+from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.scene import load_scene
 from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, opaque_casters
@@ -256,18 +257,17 @@ def test_what_does_not_fit_is_refused_and_run_again_not_cut():
     samples, casters = surface_samples(camera, 3), soup(camera, rng)
     light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
     whole = cast("cluster_hierarchy", CLUSTERS, samples, casters, light, bias_m)
+    small = replace(CLUSTERS, branching=32, leaf_groups=4)
     with pytest.raises(InputError, match="no longer fits"):
-        cast("cluster_hierarchy", replace(CLUSTERS, leaf_groups=4), samples, casters, light, bias_m)
-    grid = shadow_grid(samples, 8)
-    frame = shadow_frame(samples, casters_on_device(casters), light, grid, bias_m)
-    plan = fitted("cluster_hierarchy", replace(CLUSTERS, leaf_groups=4), frame, unrolled=True)
+        cast("cluster_hierarchy", small, samples, casters, light, bias_m)
+    frame = shadow_frame(samples, casters_on_device(casters), light, shadow_grid(samples, 8), bias_m)
+    plan = fitted("cluster_hierarchy", small, frame, unrolled=True)
     assert plan.leaf_groups > 4 and plan.level_groups
+    # The program that is timed, as a GPU runs it: another branching, no loops, and the same mask.
     with jax.enable_x64(True):
         shadowed, overflowed = shadow_program("cluster_hierarchy", plan)(frame)
     assert not bool(overflowed)
-    as_image = on_host(run_program("cluster_hierarchy", plan, frame), plan, frame)
-    assert (as_image.shadowed == whole.shadowed).all()
-    assert int(np.asarray(shadowed).sum()) == whole.shadowed.sum()
+    assert (from_runs(np.asarray(shadowed), camera.viewport) == whole.shadowed).all() and whole.shadowed.any()
 
 
 def gallery_case(n_triangles: int, size_px: int):
