@@ -16,7 +16,6 @@ from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight
 from vtfs.shadow_mask import (
-    CastersOnDevice,
     ShadowFrame,
     ShadowMask,
     ShadowPlan,
@@ -27,6 +26,7 @@ from vtfs.shadow_mask import (
 from vtfs.shadow_volumes.cluster_hierarchy import cluster_hierarchy
 from vtfs.shadow_volumes.ptsv import ptsv
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
+from vtfs.shadow_volumes.walk import LANES, LEAF_LANES
 from vtfs.shadow_volumes.z_fail import z_fail
 from vtfs.shadow_volumes.z_pass import z_pass
 from vtfs.view_samples import ViewSamples
@@ -115,7 +115,7 @@ def fitted(technique: str, plan: ShadowPlan, frame: ShadowFrame, unrolled: bool 
     plan = replace(
         plan,
         clusters=plan.clusters or _rounded_up("clusters", n_samples // 8, _FIRST.clusters),
-        groups=plan.groups or _rounded_up("lists", frame.triangles.shape[0], _FIRST.groups),
+        groups=plan.groups or _rounded_up("lists", 2 * frame.triangles.shape[0], _FIRST.groups),
         leaf_groups=plan.leaf_groups or _rounded_up("leaf lists", n_samples // 8, _FIRST.leaf_groups),
         level_groups=(),
     )
@@ -251,23 +251,9 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
 def _memory(plan: ShadowPlan, frame: ShadowFrame) -> int:
     """Lists of all levels that are held at once, planes of all triangles, and the tree."""
     groups = sum(plan.level_groups) if plan.level_groups else 2 * plan.groups
-    lists = 4 * (32 * groups + 4 * plan.leaf_groups) + 12 * plan.branching * groups
-    planes = frame.triangles.shape[0] * (8 * 10 + 4 + 4 * (13 + (9 if plan.extra != "off" else 0)))
+    lists = 4 * (LANES * groups + LEAF_LANES * plan.leaf_groups) + 12 * plan.branching * groups
+    planes = frame.triangles.shape[0] * (8 * 13 + 4 * (13 + (9 if plan.extra != "off" else 0)))
     n_items = plan.clusters or int(np.prod(frame.receives.shape)) // plan.tile_px**2
     tree = 24 * n_items * plan.branching // (plan.branching - 1)
     samples = 16 * int(np.prod(frame.receives.shape))
     return lists + planes + tree + samples
-
-
-__all__ = [
-    "SHADOW_TECHNIQUES",
-    "CastShadows",
-    "CastersOnDevice",
-    "cast_shadows",
-    "fitted",
-    "on_host",
-    "run_program",
-    "shadow_counts",
-    "shadow_grid",
-    "shadow_program",
-]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from tests.strategies import SMALL, a_camera, seeds, surface_samples
 from vtfs.camera import Camera, Viewport, load_cameras
 from vtfs.gallery import build_scene
+from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.scene import load_scene
 from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, opaque_casters
@@ -256,18 +258,17 @@ def test_what_does_not_fit_is_refused_and_run_again_not_cut():
     samples, casters = surface_samples(camera, 3), soup(camera, rng)
     light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
     whole = cast("cluster_hierarchy", CLUSTERS, samples, casters, light, bias_m)
+    small = replace(CLUSTERS, branching=32, leaf_groups=4)
     with pytest.raises(InputError, match="no longer fits"):
-        cast("cluster_hierarchy", replace(CLUSTERS, leaf_groups=4), samples, casters, light, bias_m)
-    grid = shadow_grid(samples, 8)
-    frame = shadow_frame(samples, casters_on_device(casters), light, grid, bias_m)
-    plan = fitted("cluster_hierarchy", replace(CLUSTERS, leaf_groups=4), frame, unrolled=True)
+        cast("cluster_hierarchy", small, samples, casters, light, bias_m)
+    frame = shadow_frame(samples, casters_on_device(casters), light, shadow_grid(samples, 8), bias_m)
+    plan = fitted("cluster_hierarchy", small, frame, unrolled=True)
     assert plan.leaf_groups > 4 and plan.level_groups
+    # The program that is timed, as a GPU runs it: another branching, no loops, and the same mask.
     with jax.enable_x64(True):
         shadowed, overflowed = shadow_program("cluster_hierarchy", plan)(frame)
     assert not bool(overflowed)
-    as_image = on_host(run_program("cluster_hierarchy", plan, frame), plan, frame)
-    assert (as_image.shadowed == whole.shadowed).all()
-    assert int(np.asarray(shadowed).sum()) == whole.shadowed.sum()
+    assert (from_runs(np.asarray(shadowed), camera.viewport) == whole.shadowed).all() and whole.shadowed.any()
 
 
 def gallery_case(n_triangles: int, size_px: int):
@@ -302,6 +303,21 @@ def test_mismatches_are_told_apart():
     assert facing_light(casters, light).tolist() == [True]
 
 
+@functools.cache
+def real_case(frame: int):
+    """One view of a real scene at 256 squared, and what brute force says of it: four thousand million pairs."""
+    scenes = Path(__file__).parents[3] / "shared" / "scenes"
+    scene = load_scene(scenes / "zdm2.glb")
+    camera = load_cameras(scenes / "zdm2.cameras.json").camera(frame)
+    samples = trace_view_samples(scene, replace(camera, viewport=Viewport(256, 256)))
+    low, high = scene.bounds_m
+    light = ShadowLight(tuple(low + (high - low) * np.array([0.45, 0.8, 0.55])))
+    casters, receives = opaque_casters(scene), facing_samples(samples, light)
+    points = view_points_m(samples, receives)
+    reference = brute_force(points, casters, light, default_bias_m(casters), np.array(camera.eye_m))
+    return samples, casters, light, receives, points, reference
+
+
 @pytest.mark.shared
 @pytest.mark.parametrize("frame", [0, 9])
 @pytest.mark.parametrize(
@@ -316,13 +332,9 @@ def test_mismatches_are_told_apart():
     ids=str,
 )
 def test_every_variant_on_a_real_scene(technique, plan, frame):
-    scenes = Path(__file__).parents[3] / "shared" / "scenes"
-    scene = load_scene(scenes / "zdm2.glb")
-    camera = load_cameras(scenes / "zdm2.cameras.json").camera(frame)
-    samples = trace_view_samples(scene, replace(camera, viewport=Viewport(256, 256)))
-    casters = opaque_casters(scene)
-    low, high = scene.bounds_m
-    light = ShadowLight(tuple(low + (high - low) * np.array([0.45, 0.8, 0.55])))
-    receives = facing_samples(samples, light)
-    found = cast_shadows(technique, plan, samples, casters, light, receives=receives)
-    assert_equal_outside_the_bands(found.shadowed, samples, casters, light, default_bias_m(casters), 1e-3, receives)
+    samples, casters, light, receives, points, reference = real_case(frame)
+    mask = cast_shadows(technique, plan, samples, casters, light, receives=receives).shadowed
+    differs = mask[receives] != reference
+    found = classify(points, differs, casters, light, default_bias_m(casters), np.array(samples.camera.eye_m))
+    assert found.errors == 0 and found.total <= 1e-3 * len(points)
+    assert not mask[~receives].any() and 0.02 < reference.mean() < 0.98
