@@ -123,6 +123,11 @@ def fit_table(table: TimingTable, seed: int = 0) -> TableModel:
         at = label_names.index("stage")
         for key in [key for key in by_label if key[at] == FRAME]:
             parts = [other for other in by_label if other != key and _but(other, at) == _but(key, at)]
+            if any(part[at] == UNLISTED for part in parts):  # given: the stages add up already
+                rows = _medians(*by_label[key]).keys()
+                if all(rows <= _medians(*by_label[part]).keys() for part in parts):
+                    sums[key] = tuple(parts)
+                continue
             rest = _unlisted(by_label[key], [by_label[part] for part in parts])
             if rest is not None:
                 unlisted = (*key[:at], UNLISTED, *key[at + 1 :])

@@ -130,6 +130,12 @@ def test_a_frame_is_the_sum_of_its_stages_where_they_do_not_overlap():
     (whole,) = model.predict({"num_lights": far}, {"stage": ("frame",)})
     assert whole.time_ms == pytest.approx(sum(p.time_ms for p in parts))
     assert whole.time_ms == pytest.approx(0.4 + 2e-5 * 1e6 + 1e-5 * 1e6 * math.log2(1e6), rel=0.02)  # no noise
+    rest = np.full(7, 0.3)
+    given = np.concatenate([sort, shade, rest, frame])
+    listed = fit_table(
+        table({"num_lights": np.tile(n, 4)}, given, stage=(*stages[:14], *("unlisted",) * 7, *stages[14:]))
+    )
+    assert listed.sums == model.sums
     overlapping = table(
         {"num_lights": np.tile(n, 3)}, np.concatenate([sort, shade, 0.9 * (sort + shade)]), stage=stages
     )
