@@ -18,7 +18,7 @@ from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_cou
 from vtfs.camera import Viewport
 from vtfs.device import keep_compiled_programs
 from vtfs.frame import FrameInputs, count
-from vtfs.parameters import TECHNIQUES, TUNED_TECHNIQUES, configuration
+from vtfs.parameters import TUNED_TECHNIQUES, configuration
 from vtfs.scene_setup import SceneOptions, set_up
 
 FRAMES = (0, 30, 45)
@@ -171,7 +171,7 @@ def test_what_has_lost_is_never_recommended(setup, monkeypatch, tmp_path):
     FakeFrames(monkeypatch, lambda config, i: cost_ms[config.technique] + float(config.params.get("tile_px", 0)) / 100)
     path = tmp_path / "space.toml"
     path.write_text("[parameters]\ntile_px = [16, 32]\n")
-    space: Space = load_space(path, TECHNIQUES)
+    space: Space = load_space(path, TUNED_TECHNIQUES)
     found = search(space, a_workload(setup), tmp_path / "measurements.jsonl", Budget(measurements=4))
     assert (found.best.technique, found.best.params["tile_px"]) == ("tiled_deferred", 16)
     assert all(found.best.stages_ms["frame"])

@@ -113,7 +113,7 @@ def _moved(frame: ShadowFrame, light: Vector) -> Positions:
     way = light if frame.directional else minus(light, at)
     share = frame.bias_m / jnp.maximum(length(way), frame.bias_m) if not frame.directional else frame.bias_m
     x, y, z = ((a + share * w).astype(jnp.float32) for a, w in zip(at, way, strict=True))
-    return Positions(x, y, z, frame.positions.valid, frame.positions.viewport)
+    return replace(frame.positions, x_m=x, y_m=y, z_m=z)
 
 
 def _tile_boxes(samples: SampleTiles, tile: np.ndarray) -> Aabb:
