@@ -5,7 +5,7 @@ import os
 import pytest
 from hypothesis import settings
 
-# The same examples in every run, so that a change fails for what it did. `HYPOTHESIS_PROFILE=explore pytest` draws new ones.
+# The same examples in every run, so that a change fails for what it did; HYPOTHESIS_PROFILE=explore draws new ones.
 settings.register_profile("same", derandomize=True)
 settings.register_profile("explore", derandomize=False)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
