@@ -219,7 +219,8 @@ class SceneWorkload:
 
         None where `env` is empty: of what has lost, and where the frame is one stage.
         """
-        stages = REGISTRY[config.technique].stages_of(self._inputs[0].has_transparent) if env else ()
+        technique = REGISTRY[config.technique]
+        stages = technique.stages_of(technique.plan(config), self._inputs[0].has_transparent) if env else ()
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:

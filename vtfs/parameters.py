@@ -103,6 +103,14 @@ PARAMETERS: dict[str, Parameter] = {
         ),
         Parameter("branching", 32, "children of a node of the light tree", choices=(2, 4, 8, 16, 32, 64)),
         Parameter(
+            "assigner",
+            "auto",
+            "how lists are made, which never changes them: as published (all lights against all cells, or a tree of "
+            "lights), from groups of cells to cells, or, as faster on the device, all pairs while lights are few, "
+            "then groups",
+            choices=("auto", "published", "coarse_to_fine"),
+        ),
+        Parameter(
             "batch",
             0,
             "queries in one chunk: clusters when assigning, samples when shading; "
@@ -156,14 +164,14 @@ _TILES = ("tile_px", "tile_px_x", "tile_px_y", "grid")
 _SLICES = ("depth_slices", "depth_scheme")
 _CLUSTERS = ("bounds", "cull", "unique", "normal_bins", "normal_cones")
 _SHADING = ("gbuffer", "light_cutoff")
-_BRUTE_FORCE = ("batch", *_CLUSTERS, *_SHADING)
-_BY_TREE = (*_TILES, *_SLICES, "branching", "batch", *_CLUSTERS, "leaf_test", *_SHADING)
+_BRUTE_FORCE = ("assigner", "batch", *_CLUSTERS, *_SHADING)
+_BY_TREE = (*_TILES, *_SLICES, "branching", "assigner", "batch", *_CLUSTERS, "leaf_test", *_SHADING)
 
 TECHNIQUES: dict[str, tuple[str, ...]] = {
     "forward": ("prepass", "batch", *_SHADING),
     "deferred": ("batch", *_SHADING),
     "deferred_stencil": ("batch", *_SHADING),
-    "tiled_forward": (*_TILES, "batch", "cull", *_SHADING),
+    "tiled_forward": (*_TILES, "assigner", "batch", "cull", *_SHADING),
     "tiled_forward_prez": (*_TILES, *_BRUTE_FORCE),
     "tiled_deferred": (*_TILES, *_BRUTE_FORCE),
     "clustered_deferred": _BY_TREE,
@@ -181,6 +189,11 @@ in their passes over the geometry run the same programs: `tiled_forward_prez` th
 _OWN_DEFAULTS: dict[tuple[str, str], Value] = {
     ("tiled_deferred", "bounds"): "depth_range",
     ("tiled_forward_prez", "bounds"): "depth_range",
+    # What tells these from one another is how they make their lists.
+    ("volume_tiled", "assigner"): "published",
+    ("volume_tiled_bvh", "assigner"): "published",
+    ("clustered_deferred", "assigner"): "published",
+    ("clustered_forward", "assigner"): "published",
 }
 
 
@@ -275,4 +288,15 @@ def _settled(technique: str, params: dict[str, Value]) -> dict[str, Value]:
             params["cull"] = "frustum"  # nor is the cell a box
         elif params["bounds"] == "frustum" and not exact:
             params["bounds"] = "implicit"
+    if params.get("assigner") == "coarse_to_fine" and not passes_only_what_meets_the_box(params):
+        name = "leaf_test" if params.get("leaf_test") == "box" else "cull"
+        raise ConflictError(
+            f"parameter `assigner` = 'coarse_to_fine' with {name}={params[name]}: groups are tested by their boxes, "
+            "which that test does not keep to; give cull=box or frustum and leaf_test=sphere, or assigner=published."
+        )
     return params
+
+
+def passes_only_what_meets_the_box(params: Mapping[str, Value]) -> bool:
+    """Is a light listed only where its sphere meets the box of the cell? Lists of groups of cells rely on it."""
+    return params.get("cull", "box") in ("box", "frustum") and params.get("leaf_test", "sphere") == "sphere"

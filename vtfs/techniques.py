@@ -13,10 +13,12 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
+from vtfs.bit_lists import WORD_BITS
 from vtfs.cluster_grid import ClusterGrid
 from vtfs.clusters import Bounds, Clusters, Unique, everything, form_clusters
 from vtfs.gbuffer import GBuffer, LayerTable, Positions
 from vtfs.light_assignment.brute_force import assign_brute_force
+from vtfs.light_assignment.coarse_to_fine import GROUP, assign_coarse_to_fine
 from vtfs.light_assignment.light_tree import (
     LightTree,
     assign_tree,
@@ -29,12 +31,22 @@ from vtfs.light_lists import AssignCounts, LightLists, ViewLights
 from vtfs.light_volumes import LightPixels, draw_light_volumes, shade_light_volumes
 from vtfs.morton import morton_codes
 from vtfs.normal_cones import Components, ConeKind
-from vtfs.parameters import Configuration
+from vtfs.parameters import Configuration, passes_only_what_meets_the_box
 from vtfs.shading import Image, blend_layers, chunk_blocks, shade
 
 _TESTS_AT_ONCE = {"cpu": 2**19, "gpu": 2**22}
 """`batch = 0` means all queries at once, as far as their rows of boxes stay in the cache of a CPU (12 MB) or leave
 the memory of a GPU to others (100 MB)."""
+
+_WORDS_AT_ONCE = {"cpu": 2**14, "gpu": 2**22}
+"""The same, in words of 32 tests, where lists are refined: one light is loaded for all cells of a group."""
+
+_FEW_LIGHTS = {"cpu": 256, "gpu": 256}
+"""Up to so many lights `auto` tests all pairs; see `benchmarks/light_assignment.py`."""
+
+Assigner = Literal["published", "coarse_to_fine", "auto"]
+Walked = Literal["all_pairs", "tree", "groups"]
+"""How lists were made: every light against every cell, by a tree of lights, or from groups of cells to cells."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +54,7 @@ class Plan:
     """What is static in a frame's programs: it fixes array shapes. A stage sees only what it names.
 
     - `two_lists`: transparent samples have lists of their own.
+    - `assigner`: `published` also where `auto` has no choice.
     - `cells`, `blocks`, `pairs`: rounded capacities (see `frame.Sizes`).
     """
 
@@ -53,6 +66,7 @@ class Plan:
     normal_cones: ConeKind = "implicit"
     sections: bool = False
     branching: int = 0
+    assigner: Assigner = "published"
     batch: int = 0
     cells: int = 0
     blocks: int = 0
@@ -99,6 +113,7 @@ class Technique:
     def plan(self, config: Configuration) -> Plan:
         """The static part of a configuration, without capacities."""
         params = config.params
+        assigner = params.get("assigner", "published") if passes_only_what_meets_the_box(params) else "published"
         return Plan(
             bounds=params.get("bounds", "implicit"),  # type: ignore[arg-type]
             two_lists=self.two_lists,
@@ -108,6 +123,7 @@ class Technique:
             normal_cones=params.get("normal_cones", "implicit"),  # type: ignore[arg-type]
             sections=needs_sections(params.get("cull", "box")),  # type: ignore[arg-type]
             branching=int(params.get("branching", 0)),
+            assigner=assigner,  # type: ignore[arg-type]
             batch=int(params.get("batch", 0)),
         )
 
@@ -115,9 +131,17 @@ class Technique:
         """Are fragments shaded that end up hidden?"""
         return config.params.get("prepass", "off" if self.without_prepass else "on") == "off"
 
-    def stages_of(self, has_transparent: bool) -> tuple[Stage, ...]:
-        """The stages of a frame; that of transparent samples only where there are any."""
-        return tuple(stage for stage in self.stages if has_transparent or stage.name != "shade_transparent")
+    def stages_of(self, plan: Plan, has_transparent: bool) -> tuple[Stage, ...]:
+        """The stages of a frame; that of transparent samples only where there are any, and a tree of lights only where
+        the lists are made as published."""
+        stages = self.stages if plan.assigner == "published" else _without_tree(self.stages)
+        return tuple(stage for stage in stages if has_transparent or stage.name != "shade_transparent")
+
+    def walked(self, plan: Plan, n_lights: int) -> Walked:
+        """How lists are made of so many lights on this device."""
+        if plan.assigner == "published":
+            return "tree" if _BUILD_TREE in self.stages else "all_pairs"
+        return _fastest(n_lights) if plan.assigner == "auto" else "groups"
 
 
 Assigned = tuple[LightLists, AssignCounts]
@@ -151,6 +175,26 @@ def walk_chunk(batch: int, branching: int, pairs: int) -> int:
 def _assign_brute_force(plan: Plan, lights: ViewLights, light_cutoff, clusters: Clusters) -> Assigned:
     chunk = walk_chunk(plan.batch, 32, plan.pairs)
     return assign_brute_force(lights.spheres(light_cutoff), clusters, plan.pairs, chunk, plan.cull, lights.cones)
+
+
+def _fastest(n_lights: int) -> Walked:
+    return "all_pairs" if n_lights <= _FEW_LIGHTS.get(jax.default_backend(), 0) else "groups"
+
+
+def _assign_otherwise(plan: Plan, lights: ViewLights, light_cutoff, clusters: Clusters) -> Assigned:
+    """Not as published: no tree of lights."""
+    if plan.assigner == "auto" and _fastest(lights.n_lights) == "all_pairs":
+        return _assign_brute_force(plan, lights, light_cutoff, clusters)
+    spheres, chunk = lights.spheres(light_cutoff), assign_chunk("groups", plan.batch, plan.branching, plan.pairs)
+    branching = plan.branching or GROUP
+    return assign_coarse_to_fine(spheres, clusters, plan.pairs, chunk, branching, plan.cull, lights.cones)
+
+
+def assign_chunk(walked: Walked, batch: int, branching: int, pairs: int) -> int:
+    """Rows tested at once: (cluster, node) pairs, or words of 32 (cluster, light) pairs."""
+    if walked == "groups":
+        return batch or _WORDS_AT_ONCE.get(jax.default_backend(), 2**22)
+    return walk_chunk(batch, branching if walked == "tree" else WORD_BITS, pairs)
 
 
 def _assign_tree(plan: Plan, tree: LightTree, clusters: Clusters) -> Assigned:
@@ -232,6 +276,11 @@ def _all_lights(lights: ViewLights, clusters: Clusters) -> LightLists:
     return LightLists(zeros, zeros + n_lights, jnp.arange(n_lights), jnp.int32(n_lights), jnp.bool_(False))
 
 
+def _without_tree(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    kept = tuple(stage for stage in stages if stage.name not in ("reduce", "morton", "sort", "build_tree"))
+    return tuple(_ASSIGN_OTHERWISE if stage.name == "assign" else stage for stage in kept)
+
+
 _CLUSTERS = Stage(
     "clusters",
     _clusters,
@@ -241,12 +290,19 @@ _CLUSTERS = Stage(
 _ASSIGN_BRUTE_FORCE = Stage(
     "assign", _assign_brute_force, ("lights", "light_cutoff", "clusters"), ("batch", "pairs", "cull")
 )
+_BUILD_TREE = Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",))
 _ASSIGN_BY_TREE = (
     Stage("reduce", _reduce, ("lights", "light_cutoff")),
     Stage("morton", _morton, ("lights", "light_cutoff", "reduce")),
     Stage("sort", _sort, ("morton",)),
-    Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",)),
+    _BUILD_TREE,
     Stage("assign", _assign_tree, ("build_tree", "clusters"), ("branching", "batch", "pairs", "cull", "leaf_test")),
+)
+_ASSIGN_OTHERWISE = Stage(
+    "assign",
+    _assign_otherwise,
+    ("lights", "light_cutoff", "clusters"),
+    ("assigner", "branching", "batch", "pairs", "cull"),
 )
 _LIGHTS = ("lights", "light_cutoff")
 _SHADE = (

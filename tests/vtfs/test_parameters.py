@@ -74,7 +74,7 @@ def test_defaults_are_those_of_the_design():
     defaults = {name: parameter.default for name, parameter in PARAMETERS.items()}
     assert defaults == {
         "tile_px": 32, "tile_px_x": 0, "tile_px_y": 0, "grid": "off", "depth_slices": 0, "depth_scheme": "self_similar",
-        "branching": 32, "batch": 0, "bounds": "implicit", "cull": "box", "leaf_test": "sphere",
+        "branching": 32, "assigner": "auto", "batch": 0, "bounds": "implicit", "cull": "box", "leaf_test": "sphere",
         "unique": "page_table", "normal_bins": 0, "normal_cones": "implicit", "gbuffer": "float32", "light_cutoff": 0.0,
         "prepass": "on",
     }  # fmt: skip
@@ -83,6 +83,11 @@ def test_defaults_are_those_of_the_design():
     assert {key: value for key, value in own.items() if value != defaults[key[1]]} == {
         ("tiled_deferred", "bounds"): "depth_range",
         ("tiled_forward_prez", "bounds"): "depth_range",
+        # What tells these apart is how they make their lists.
+        **{
+            (name, "assigner"): "published"
+            for name in ("volume_tiled", "volume_tiled_bvh", "clustered_deferred", "clustered_forward")
+        },
     }
 
 
