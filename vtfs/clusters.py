@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from vtfs.bit_lists import bits_below, last_not_above, n_bits_set, pack_bits, set_bits, starts_of
 from vtfs.bounds import Aabb
@@ -102,7 +103,7 @@ def form_clusters(
         key = key + jnp.where(is_transparent_run, n_keys, 0)[:, None]
     key = jnp.where(positions.valid, key, -1)
     # Bit i of a sample's word: sample i of the same run lies in the same cell. The lowest one leads.
-    together = pack_bits(key[:, :, None] == key[:, None, :])[..., 0]
+    together = _equal_in_run(key)
     leader = n_bits_set(~together & (together - jnp.uint32(1)))
     leads = pack_bits((leader == jnp.arange(RUN)) & positions.valid)
     start, n_blocks = starts_of(n_bits_set(leads[:, 0]))
@@ -171,6 +172,18 @@ def form_clusters(
         section,
         cones,
     )
+
+
+def _equal_in_run(key: Int[Array, "runs 32"]) -> UInt32[Array, "runs 32"]:
+    """For each sample one bit for each sample of its run: have they the same key?"""
+    if jax.default_backend() == "cpu":
+        return pack_bits(key[:, :, None] == key[:, None, :])[..., 0]
+    # On a GPU a thread makes a word of its own: a reduction would have 32 threads meet for each.
+    key = jax.lax.optimization_barrier(key)
+    words = jnp.zeros(key.shape, jnp.uint32)
+    for lane in range(RUN):
+        words |= (key == key[:, lane, None]).astype(jnp.uint32) << lane
+    return words
 
 
 def _farthest_solid_m(

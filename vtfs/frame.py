@@ -147,7 +147,8 @@ class FrameInputs:
             env["normals"] = env["gbuffer"].normal if needs_normals else None
         elif technique.lists == "light_volumes":  # for its pixels
             env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
-        return env
+        # A dozen scalars, each of which would be sent to a GPU by itself in every frame: 0.3 ms.
+        return jax.device_put(env)
 
 
 def planned(config: Configuration, sizes: Sizes) -> Plan:
