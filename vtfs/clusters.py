@@ -210,8 +210,10 @@ def _by_page_table(block_key: Int[Array, " capacity"], in_use: Bool[Array, " cap
     """Keys of the clusters in ascending order, their number, and the cluster of each block."""
     place = jnp.arange(block_key.shape[0], dtype=jnp.int32)
     # Unused places write past the end, which `drop` leaves out.
-    flags = jnp.zeros(cells_capacity, bool).at[jnp.where(in_use, block_key, cells_capacity)].set(True, mode="drop")
-    words = pack_bits(flags.reshape(-1, RUN))
+    # Bytes are a quarter of the memory to clear, but a GPU writes one by replacing the word around it.
+    flag = jnp.bool_ if jax.default_backend() == "cpu" else jnp.int32
+    flags = jnp.zeros(cells_capacity, flag).at[jnp.where(in_use, block_key, cells_capacity)].set(1, mode="drop")
+    words = pack_bits(flags.reshape(-1, RUN) != 0)
     cell_start, n_clusters = starts_of(n_bits_set(words[:, 0]))
     row, bit = set_bits(words, cell_start, place)
     block_word = block_key // RUN

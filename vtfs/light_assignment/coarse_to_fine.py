@@ -87,15 +87,16 @@ def assign_coarse_to_fine(
     n_words = n_leaf_nodes(n_lights, WORD_BITS)
     rooms = _rooms(capacity, n_lights, len(levels))
     overflowed, words, absent, held = jnp.bool_(False), [], [], n_words * WORD_BITS
-    if n_lights < _MANY:
-        first, n_first = jnp.arange(held, dtype=jnp.int32), jnp.int32(n_lights)
-    else:
-        held = rooms[0]
-        first, n_first = list_near_any(lights, clusters.box, _used(clusters), held)
-        overflowed = n_first > held
-    lists = NodeLists(first, jnp.zeros(1, jnp.int32), n_first[None])
     # Places past the lights are read by lanes that are masked.
-    lights, cones = jax.tree.map(lambda column: jnp.pad(column, (0, n_words * WORD_BITS - n_lights)), (lights, cones))
+    lights, cones = jax.tree.map(lambda column: jnp.pad(column, (0, held - n_lights)), (lights, cones))
+    near, n_near = None, jnp.int32(n_lights)
+    if n_lights >= _MANY:
+        held = rooms[0]
+        near, n_near = list_near_any(lights, n_lights, clusters.box, _used(clusters), held)
+        overflowed = n_near > held
+        # Their columns are so few that a GPU's cache holds them, wherever in the lists they are read.
+        lights, cones = jax.tree.map(lambda column: column[near], (lights, cones))
+    lists = NodeLists(jnp.arange(held, dtype=jnp.int32), jnp.zeros(1, jnp.int32), n_near[None])
     culls_more = cull != "box" or cones is not None or clusters.cones is not None
 
     def keep(cluster, sphere, cone):
@@ -120,8 +121,9 @@ def assign_coarse_to_fine(
         overflowed |= total > room
         held = room
     n = clusters.key.shape[0]
+    index = lists.light if near is None else near[lists.light]
     counts = AssignCounts(_stack(words[:-1]), _stack(absent[:-1]), words[-1], absent[-1])
-    return LightLists(lists.offset[:n], lists.count[:n], lists.light, total, overflowed), counts
+    return LightLists(lists.offset[:n], lists.count[:n], index, total, overflowed), counts
 
 
 def n_tests(counts: AssignCounts) -> tuple[int, int]:

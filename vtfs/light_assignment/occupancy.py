@@ -46,11 +46,16 @@ def near_any(spheres: Sphere, boxes: Aabb, used: Bool[Array, " boxes"]) -> Bool[
 
 
 def list_near_any(
-    spheres: Sphere, boxes: Aabb, used: Bool[Array, " boxes"], capacity: int
+    spheres: Sphere, n_spheres: int, boxes: Aabb, used: Bool[Array, " boxes"], capacity: int
 ) -> tuple[Int[Array, " capacity"], Int[Array, ""]]:
-    """The spheres of `near_any` in ascending order, and how many there are, also where that is more than `capacity`."""
-    near = near_any(spheres, boxes, used)
-    words: UInt32[Array, "words 1"] = pack_bits(jnp.pad(near, (0, -near.shape[0] % WORD_BITS)).reshape(-1, WORD_BITS))
+    """The spheres of `near_any` in ascending order, and how many there are, also where that is more than `capacity`.
+
+    **Arguments:**
+
+    - `n_spheres`: the first of them that count; there are columns for a multiple of 32.
+    """
+    near = near_any(spheres, boxes, used) & (jnp.arange(spheres.x_m.shape[0]) < n_spheres)
+    words: UInt32[Array, "words 1"] = pack_bits(near.reshape(-1, WORD_BITS))
     start, total = starts_of(n_bits_set(words[:, 0]))
     word, bit = set_bits(words, start, jnp.minimum(jnp.arange(capacity, dtype=jnp.int32), jnp.maximum(total - 1, 0)))
     return word * WORD_BITS + bit, total
