@@ -37,6 +37,8 @@ class Parameter:
     @property
     def allowed(self) -> str:
         """The values, for a message to the user."""
+        if self.choices == _BATCHES:
+            return f"0, or a power of two from {_BATCHES[1]} to {_BATCHES[-1]}"
         if self.choices:
             return ", ".join(str(choice) for choice in self.choices)
         if isinstance(self.default, str):

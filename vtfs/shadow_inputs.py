@@ -29,7 +29,7 @@ from vtfs.shadow_mask import (
 )
 from vtfs.shadow_references import ShadowRays, brute_force, kept_casters, view_points_m
 from vtfs.shadow_techniques import grid_of
-from vtfs.shadow_volumes.walk import rotated
+from vtfs.shadow_volumes.volumes import rotated
 
 if TYPE_CHECKING:
     from vtfs.scene import Scene

@@ -25,9 +25,10 @@ from vtfs.shadow_mask import (
     shadow_frame,
 )
 from vtfs.shadow_volumes.cluster_hierarchy import cluster_hierarchy
+from vtfs.shadow_volumes.full_tree import n_cells
+from vtfs.shadow_volumes.levels import LANES, LEAF_LANES
 from vtfs.shadow_volumes.ptsv import ptsv
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
-from vtfs.shadow_volumes.walk import LANES, LEAF_LANES
 from vtfs.shadow_volumes.z_fail import z_fail
 from vtfs.shadow_volumes.z_pass import z_pass
 from vtfs.view_samples import ViewSamples
@@ -155,11 +156,18 @@ def fitted_to_all(
 ) -> tuple[ShadowPlan, list[ShadowMask]]:
     """The plan with capacities that hold all of several frames, and their masks; see `fitted`."""
     n_samples = int(np.prod(frames[0].receives.shape))
+    n_triangles = frames[0].triangles.shape[0]
+    viewport = frames[0].positions.viewport
+    if plan.tree == "full":
+        columns, rows = -(-viewport.width_px // plan.tile_px), -(-viewport.height_px // plan.tile_px)
+        n_slices = max(int(frame.grid.depth_slices) for frame in frames)
+        plan = replace(plan, cells=n_cells(columns, rows, n_slices, plan.branching))
     plan = replace(
         plan,
         clusters=plan.clusters or _rounded_up("clusters", n_samples // 8, _FIRST.clusters),
-        groups=plan.groups or _rounded_up("lists", 2 * frames[0].triangles.shape[0], _FIRST.groups),
+        groups=plan.groups or _rounded_up("lists", 2 * n_triangles, _FIRST.groups),
         leaf_groups=plan.leaf_groups or _rounded_up("leaf lists", n_samples // 8, _FIRST.leaf_groups),
+        pairs=plan.pairs or (_rounded_up("pairs", 4 * n_triangles, 2**10) if plan.passes == 2 else 0),
         level_groups=(),
     )
     while True:
@@ -168,12 +176,14 @@ def fitted_to_all(
         if not any(bool(mask.overflowed) for mask in masks):
             break
         n_blocks = max(int(mask.counts.n_blocks) for mask in masks)
+        n_pairs = max(int(mask.counts.n_pairs) for mask in masks)
         grown = replace(plan, clusters=_rounded_up("clusters", n_blocks, plan.clusters))
         if n_blocks <= plan.clusters:  # else the lists are meaningless
             grown = replace(
                 grown,
                 groups=_rounded_up("lists", _more(needed[:-1].max(), plan.groups), plan.groups),
                 leaf_groups=_rounded_up("leaf lists", _more(needed[-1], plan.leaf_groups), plan.leaf_groups),
+                pairs=_rounded_up("pairs", n_pairs, plan.pairs) if plan.pairs else 0,
             )
         log.info("%s: %s does not fit, trying %s", technique, plan, grown)
         if grown == plan:
@@ -257,21 +267,25 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
       papers. `test_and_set_in_cluster` counts there only the samples of the cluster itself. With a stencil: one for
       each
       sample and volume polygon that passes (z_pass) or fails (z_fail) the depth test; what the tiles cost stays apart.
-    - `node_tests_0` ...: of them, on each level below the root; `accepted_*`, `refined_*` likewise, the others are
-      rejected.
+    - `node_tests_0` ...: of them, on each level below the root; `accepted_*`, `refined_*`, `dropped_*` likewise, the
+      others are rejected. `dropped_nodes`, `dropped_samples`: pairs that feedback spares.
+    - `tests_of_largest`: of the 1,024 triangles with the most tests: how unevenly the work lies.
     - `extra_plane_tests`: planes tested beyond the four of a volume.
     - `memory`: bytes of the structures at their capacities.
     """
     counts = mask.counts
-    nodes, accepted, refined, extra = (
+    nodes, accepted, refined, dropped, extra = (
         np.asarray(column).astype(np.int64)
-        for column in (counts.node_tests, counts.accepted, counts.refined, counts.extra_plane_tests)
+        for column in (counts.node_tests, counts.accepted, counts.refined, counts.dropped, counts.extra_plane_tests)
     )
     per_level = {
         f"{name}_{level}": int(value)
-        for name, column in (("node_tests", nodes), ("accepted", accepted), ("refined", refined))
+        for name, column in (
+            ("node_tests", nodes), ("accepted", accepted), ("refined", refined), ("dropped", dropped)
+        )
         for level, value in enumerate(column)
-    }
+    }  # fmt: skip
+    of_triangle = np.sort(np.asarray(counts.tests_of_triangle).astype(np.int64))
     updates = int(counts.stencil_updates)
     on_nodes = int(nodes.sum())
     lengths = np.asarray(counts.list_length).astype(np.int64)
@@ -284,6 +298,9 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
         "node_tests": on_nodes,
         "sample_tests": int(counts.sample_tests),
         "extra_plane_tests": 3 * int(extra.sum()),
+        "dropped_nodes": int(dropped.sum()),
+        "dropped_samples": int(counts.dropped_samples),
+        "tests_of_largest": int(of_triangle[-1_024:].sum()),
         "longest_list": int(lengths.max(initial=0)),
         "listed_pairs": int(lengths.sum()),
         "memory": _memory(plan, frame),
@@ -310,7 +327,7 @@ def _memory(plan: ShadowPlan, frame: ShadowFrame) -> int:
     groups = sum(plan.level_groups) if plan.level_groups else 2 * plan.groups
     lists = 4 * (LANES * groups + LEAF_LANES * plan.leaf_groups) + 12 * plan.branching * groups
     planes = frame.triangles.shape[0] * (8 * 13 + 4 * (13 + (9 if plan.extra != "off" else 0)))
-    n_items = plan.clusters or int(np.prod(frame.receives.shape)) // plan.tile_px**2
+    n_items = plan.cells or plan.clusters or int(np.prod(frame.receives.shape)) // plan.tile_px**2
     tree = 24 * n_items * plan.branching // (plan.branching - 1)
     samples = 16 * int(np.prod(frame.receives.shape))
     return lists + planes + tree + samples

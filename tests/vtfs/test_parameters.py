@@ -42,6 +42,7 @@ def test_a_bad_value_is_refused_by_name_with_what_is_allowed(name, value):
         ("tile_px", "a whole number from 2 to 256"),
         ("depth_slices", "a whole number from 0 to 1024"),
         ("branching", "2, 4, 8, 16, 32, 64"),
+        ("batch", "0, or a power of two from 32 to 16777216"),
         ("light_cutoff", "a number from 0 to 0.99"),
         ("bounds", "implicit, explicit, packed, frustum, depth_range"),
         ("tile_px_x", "a whole number from 2 to 256, or 0: tile_px"),
