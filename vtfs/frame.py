@@ -15,6 +15,7 @@ from vtfs.cluster_grid import cluster_grid, configured_grid, n_cells, n_keys, ti
 from vtfs.gbuffer import RUN_WIDTH_PX, Fragments, GBuffer, LayerTable, Positions, from_runs
 from vtfs.input_error import InputError
 from vtfs.light_lists import view_lights
+from vtfs.light_shadows import CastMask
 from vtfs.lights import Lights
 from vtfs.op_counts import (
     ListLengths,
@@ -40,6 +41,7 @@ from vtfs.shadow_techniques import (
     on_host,
     shadow_plan,
     shadow_sizes,
+    shadows_counts,
     with_shadow_sizes,
 )
 from vtfs.techniques import REGISTRY, Plan, Stage, volume_chunk, walk_chunk
@@ -71,7 +73,9 @@ class Sizes:
 
     def covering(self, other: Sizes) -> Sizes:
         """What holds both; of the same technique and plan."""
-        shadow = tuple(max(a, b) for a, b in zip(self.shadow, other.shadow, strict=True)) if self.shadow and other.shadow else self.shadow or other.shadow
+        shadow = self.shadow or other.shadow
+        if self.shadow and other.shadow:
+            shadow = tuple(map(max, self.shadow, other.shadow))
         return Sizes(max(self.cells, other.cells), max(self.blocks, other.blocks), max(self.pairs, other.pairs), shadow)
 
 
@@ -220,27 +224,34 @@ def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
 def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable[..., Any]:
     """All stages fused: from the inputs to the image and whether anything overflowed.
 
-    One program; of shadow techniques two, as shadows are found in float64 and shaded in float32: from view samples to
-    the mask of a light, run for each, and from the masks to the image.
+    One program; of shadow techniques two, as shadows are found in float64 and shaded in float32: `cast_program`, and
+    from its masks to the image.
     """
     stages = REGISTRY[technique].stages_of(has_transparent)
     casting = tuple(stage for stage in stages if stage.per_shadow)
-    shading = tuple(stage for stage in stages if not stage.per_shadow)
-    image = _fused(shading, replace(plan, shadow=None))
+    image = _fused(tuple(stage for stage in stages if not stage.per_shadow), replace(plan, shadow=None))
     if not casting:
         return image
-    cast = _for_each_shadow(_fused_casting(casting, Plan(shadow=plan.shadow)))
+    cast = cast_program(technique, plan)
 
     def run(env: dict[str, Any]):
-        shading_env = {name: value for name, value in env.items() if name != "shadow_tasks"}
-        return image(shading_env | {casting[-1].name: cast(env["shadow_tasks"])})
+        shading = {name: value for name, value in env.items() if name != "shadow_tasks"}
+        return image(shading | {casting[-1].name: cast(env["shadow_tasks"])})
 
     return run
 
 
+def cast_program(technique: str, plan: Plan) -> Callable[[list[ShadowTask]], list[CastMask]]:
+    """From view samples to the mask of one light on one view, fused, and run for each of them."""
+    casting = tuple(stage for stage in REGISTRY[technique].stages if stage.per_shadow)
+    if len(casting) == 1:  # the same program: it is compiled once
+        return stage_program(casting[0], narrowed(casting[0], plan))
+    return _for_each_shadow(_fused_casting(casting, Plan(shadow=plan.shadow)))
+
+
 @functools.cache
-def _fused_casting(stages: tuple[Stage, ...], plan: Plan) -> Callable[..., Any]:
-    def run(task: ShadowTask):
+def _fused_casting(stages: tuple[Stage, ...], plan: Plan) -> Callable[[ShadowTask], CastMask]:
+    def run(task: ShadowTask) -> CastMask:
         env: dict[str, Any] = {"shadow_tasks": task}
         for stage in stages:
             env[stage.name] = stage.run(plan, *(env[name] for name in stage.needs))
@@ -398,9 +409,7 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     return frame_counts, lengths
 
 
-def _count_shadowed(
-    config: Configuration, inputs: FrameInputs, sizes: Sizes | None
-) -> tuple[FrameCounts, ListLengths]:
+def _count_shadowed(config: Configuration, inputs: FrameInputs, sizes: Sizes | None) -> tuple[FrameCounts, ListLengths]:
     """What shading does as for its lists, with what finding the shadows takes."""
     shading, lengths = count(lists_configuration(config), inputs, sizes)
     counts = dict(shading.technique)
@@ -410,8 +419,8 @@ def _count_shadowed(
     shadow: tuple[int, ...] = ()
     if config.technique not in SHADOW_REFERENCES:
         cast, shadow = cast_counted(config, inputs)
-        counts |= {name: sum(each.counts[name] for each in cast) for name in cast[0].counts}
-        counts["memory"] += shading.technique["memory"]
+        own = shadows_counts([each.counts for each in cast])
+        counts |= own | {"memory": counts["memory"] + own["memory"]}
     return replace(shading, technique=counts, sizes=replace(shading.sizes, shadow=shadow)), lengths
 
 

@@ -149,7 +149,9 @@ PARAMETERS: dict[str, Parameter] = {
             choices=("float32", "float16", "bfloat16"),
         ),
         Parameter("light_cutoff", 0.0, "lights reach only where their window is above this", low=0.0, high=0.99),
-        Parameter("planes", "on", "planes that reject nodes besides the four of a shadow volume", choices=("on", "off")),
+        Parameter(
+            "planes", "on", "planes that reject nodes besides the four of a shadow volume", choices=("on", "off")
+        ),
         Parameter(
             "front_faces",
             "cast",
@@ -288,9 +290,29 @@ def configuration(technique: str, params: Mapping[str, object] | None = None) ->
             raise InputError(f"parameter `{name}`: unknown; `{technique}` has {', '.join(names)}.")
         if name not in names:
             raise InputError(f"parameter `{name}`: `{technique}` does not have it; it has {', '.join(names)}.")
-    parsed = {name: parameter_of(technique, name).parse(given.get(name, default_value(technique, name))) for name in names}
+    parsed = {
+        name: parameter_of(technique, name).parse(given.get(name, default_value(technique, name))) for name in names
+    }
     settled = _settled(technique, parsed)
     return Configuration(technique, tuple((name, settled[name]) for name in names))
+
+
+def exact_configuration(config: Configuration) -> Configuration:
+    """The same without what trades accuracy for speed."""
+    names = [name for name in CHANGES_IMAGE if name in config.params]
+    return config.replaced(**{name: default_value(config.technique, name) for name in names})
+
+
+def is_exact(config: Configuration) -> bool:
+    """Must its image be that of the reference?"""
+    return config == exact_configuration(config)
+
+
+def changes_shadows(config: Configuration) -> bool:
+    """May its shadows be others than those of its casters, as those of a stencil of 8 bits?"""
+    return any(
+        config.params.get(name, value) != value for name, value in (("stencil", "unlimited"), ("around_eye", "on"))
+    )
 
 
 def lists_configuration(config: Configuration) -> Configuration:

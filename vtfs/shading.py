@@ -83,7 +83,7 @@ def reflected(
 def _facing(
     surface: Surface, to: tuple[Float[Array, "*s"], ...], distance: Float[Array, "*s"] | float
 ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
-    """`max(0, n.l)` times the distance, and `specular * max(0, n.h)**shininess`, of light from `to`, `distance` away."""
+    """`max(0, n.l)` times the distance, and `specular * max(0, n.h)**shininess` of light that comes from `to`."""
     n_x, n_y, n_z = surface.normal
     to_x, to_y, to_z = to
     n_dot_to = jnp.maximum(n_x * to_x + n_y * to_y + n_z * to_z, 0)

@@ -49,6 +49,7 @@ SHADOW_TECHNIQUES: dict[str, ShadowTechnique] = {
 }
 """Shadow techniques of one signature. What differs from one plan to another is in the plan."""
 
+
 def shadow_plan(config: Configuration) -> ShadowPlan:
     """The static part of a configuration of a shadow technique, without capacities."""
     params = config.params
@@ -75,9 +76,7 @@ def with_shadow_sizes(plan: ShadowPlan, sizes: tuple[int, ...]) -> ShadowPlan:
     if not sizes:
         return plan
     clusters, groups, leaf_groups, *level_groups = sizes
-    return replace(
-        plan, clusters=clusters, groups=groups, leaf_groups=leaf_groups, level_groups=tuple(level_groups)
-    )
+    return replace(plan, clusters=clusters, groups=groups, leaf_groups=leaf_groups, level_groups=tuple(level_groups))
 
 
 _FIRST = ShadowPlan(clusters=2**12, groups=2**10, leaf_groups=2**13)
@@ -307,6 +306,20 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
         "memory": _memory(plan, frame),
         **per_level,
     }
+
+
+def shadows_counts(of_each: Sequence[dict[str, int]]) -> dict[str, int]:
+    """Counts of the shadows of several lights and views: sums, but what is held or longest is that of the largest.
+
+    Names that shading has too are told apart: `shadow_samples` receive shadow, `shadow_clusters` are what is walked.
+    """
+    largest = {"memory", "longest_list", "casters"}
+    total = {
+        name: (max if name in largest else sum)(counts.get(name, 0) for counts in of_each)
+        for name in dict.fromkeys(name for counts in of_each for name in counts)
+    }
+    names = {"samples": "shadow_samples", "items": "shadow_clusters", "longest_list": "longest_shadow_list"}
+    return {names.get(name, name): value for name, value in total.items()}
 
 
 def _memory(plan: ShadowPlan, frame: ShadowFrame) -> int:

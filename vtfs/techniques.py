@@ -342,10 +342,9 @@ def _shadowed(name: str) -> Technique:
     """Masks of all lights that cast, then clustered shading. References bring their masks from the host."""
     run = functools.partial(_cast, name)
     cast = Stage("shadow_traverse", run, ("shadow_tasks",), ("shadow",), per_shadow=True)
-    stages = (_MERGE_SHADOWS, _CLUSTERS, *_ASSIGN_BY_TREE, *_SHADE_SHADOWED)
-    return Technique(
-        name, stages if name in SHADOW_REFERENCES else (cast, *stages), reads_gbuffer="per_sample"
-    )
+    casting = (_MERGE_SHADOWS,) if name in SHADOW_REFERENCES else (cast, _MERGE_SHADOWS)
+    stages = (_CLUSTERS, *_ASSIGN_BY_TREE, *casting, *_SHADE_SHADOWED)
+    return Technique(name, stages, reads_gbuffer="per_sample")
 
 
 _TILED = (_CLUSTERS, _ASSIGN_BRUTE_FORCE, *_SHADE)
