@@ -70,7 +70,7 @@ def oracle_texel(image, u, v):
     )
 
 
-@pytest.mark.parametrize("name", ["atrium", "street", "grove"])
+@pytest.mark.parametrize("name", ["atrium", "street", "grove", "conservatory"])
 def test_samples_are_where_rays_meet_all_triangles_in_float64(name):
     scene = build_scene(name, 1_500)
     camera = frame(scene, 40, 22, 7)
