@@ -197,8 +197,7 @@ def _stages(found: SearchResult, objective: Objective) -> dict[str, dict[str, fl
     stages: dict[str, dict[str, float]] = {}
     fastest: dict[str, Measurement] = {}
     for m in found.measurements:
-        exact = m.params.get("gbuffer") == "float32" and m.params.get("light_cutoff") == 0
-        if is_timed(m) and exact:
+        if is_timed(m) and _config(m).is_exact:
             fastest[m.technique] = min(fastest.get(m.technique, m), m, key=lambda m: time_ms(m, objective))
     for technique, m in fastest.items():
         stages[technique] = {name: float(np.median(frames[0])) for name, frames in m.stages_ms.items()}
@@ -222,7 +221,7 @@ def _pictures(workload: SceneWorkload, found: SearchResult, folder: Path) -> lis
     ]
     fastest: dict[str, Measurement] = {}
     for m in found.measurements:
-        if is_timed(m) and m.params.get("light_cutoff") == 0:
+        if is_timed(m) and _config(m).is_exact:
             fastest[m.technique] = min(fastest.get(m.technique, m), m, key=lambda m: time_ms(m, "max"))
     lengths = {technique: workload.list_lengths(_config(m)) for technique, m in fastest.items()}
     listed = {technique: own for technique, own in lengths.items() if technique != "forward"}

@@ -39,7 +39,7 @@ from vtfs.lights import Lights
 from vtfs.op_counts import OpCounts
 from vtfs.parameters import Configuration, configuration
 from vtfs.reference import forward_reference, image_error
-from vtfs.techniques import REGISTRY
+from vtfs.techniques import REGISTRY, approximates
 from vtfs.view_samples import ViewSamples
 
 log = logging.getLogger("vtfs.workload")
@@ -180,8 +180,7 @@ class SceneWorkload:
         valid = self._inputs[0].seen()
         with np.errstate(invalid="ignore", over="ignore"):  # of an image that overflowed the error is infinite
             taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), self.reference(), valid)
-        exact = config["gbuffer"] == "float32" and config["light_cutoff"] == 0
-        if exact and not taken.error <= EXACT_ERROR:
+        if config.is_exact and not taken.error <= EXACT_ERROR:
             return "failed", f"error {taken.error:.2g} against the float64 reference; float32 explains {EXACT_ERROR:g}"
         # The first run's time may be the compiler's: only a second one is held against the configuration.
         slow = time.perf_counter() - started > TIMEOUT_S
@@ -219,7 +218,8 @@ class SceneWorkload:
 
         None where `env` is empty: of what has lost, and where the frame is one stage.
         """
-        stages = REGISTRY[config.technique].stages_of(self._inputs[0].has_transparent) if env else ()
+        technique = REGISTRY[config.technique]
+        stages = technique.stages_of(self._inputs[0].has_transparent, approximates(config)) if env else ()
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:

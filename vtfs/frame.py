@@ -20,6 +20,7 @@ from vtfs.op_counts import (
     ListLengths,
     OpCounts,
     added,
+    approximation_counts,
     assign_counts,
     batch_counts,
     cluster_counts,
@@ -33,11 +34,11 @@ from vtfs.op_counts import (
     walk_rows,
 )
 from vtfs.parameters import PARAMETERS, Configuration
-from vtfs.techniques import REGISTRY, Plan, Stage, volume_chunk, walk_chunk
+from vtfs.techniques import REGISTRY, Plan, Stage, approximates, volume_chunk, walk_chunk
 from vtfs.view_samples import ViewSamples
 
 _BRUTE_FORCE_WORD = 32
-_NO_STRUCTURES = ("positions", "gbuffer", "normals", "grid", "light_cutoff")
+_NO_STRUCTURES = ("positions", "gbuffer", "normals", "grid", "light_cutoff", "approximate")
 
 
 class CapacityError(InputError):
@@ -138,11 +139,14 @@ class FrameInputs:
             "layers": self.layers,
             "lights": self.lights,
             "light_cutoff": np.float32(params["light_cutoff"]),
+            "approximate": np.float32(params.get("approximate", 0)),
+            "cluster_light": None,
         }
         if technique.lists == "clusters":
             env["grid"] = configured_grid(self.camera, params, self.deepest_m, technique.one_slice)
             # Only where they are read: each precision of the G-buffer would compile the clusters again.
-            needs_normals = params.get("normal_bins", 0) or params.get("normal_cones", "implicit") == "explicit"
+            has_cones = technique.plan(config).normal_cones == "explicit"
+            needs_normals = has_cones or params.get("normal_bins", 0)
             env["normals"] = env["gbuffer"].normal if needs_normals else None
         elif technique.lists == "light_volumes":  # for its pixels
             env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
@@ -167,16 +171,20 @@ def narrowed(stage: Stage, plan: Plan) -> Plan:
 
 def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
     """Add a stage's result to what later stages may need. An assignment's counts stay apart from its lists: their
-    shape depends on the tree, and would compile the shading again for every branching."""
+    shape depends on the tree, and would compile the shading again for every branching. What is evaluated once a
+    cluster leaves the lists."""
     if stage == "assign":
         env["assign"], env["assign_counts"] = result
+        env["listed"] = env["assign"]
+    elif stage == "approximate":
+        env["assign"], env["cluster_light"] = result
     else:
         env[stage] = result
 
 
 def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable[..., Any]:
     """All stages fused in one program: from the inputs to the image and whether anything overflowed."""
-    return _fused(REGISTRY[technique].stages_of(has_transparent), plan)
+    return _fused(REGISTRY[technique].stages_of(has_transparent, plan.approximates), plan)
 
 
 @functools.cache
@@ -215,7 +223,7 @@ def run_stages(
         grid_keys *= 2
     fitting = Sizes(rounded_up("cells", grid_keys), rounded_up("blocks", n_runs), rounded_up("pairs", 0))
     sizes = fitting.covering(sizes) if sizes else fitting
-    for stage in technique.stages_of(inputs.has_transparent):
+    for stage in technique.stages_of(inputs.has_transparent, approximates(config)):
         while True:
             plan = narrowed(stage, planned(config, sizes))
             result = stage_program(stage, plan)(*(env[name] for name in stage.needs))
@@ -292,7 +300,8 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     """Count what a configuration does on a frame; nothing is shaded."""
     technique = REGISTRY[config.technique]
     if is_listed(config):
-        env, sizes = run_stages(config, inputs, sizes, until="assign")
+        last = "approximate" if approximates(config) else "assign"
+        env, sizes = run_stages(config, inputs, sizes, until=last)
     else:
         env, sizes = inputs.environment(config), NO_SIZES
     lengths = lengths_of(config, env, inputs)
@@ -304,7 +313,9 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     rows: tuple[int, ...] = ()
     light_runs = 0
     if technique.lists == "clusters":
-        counts |= cluster_counts(lengths, n_cells(env["grid"], inputs.viewport), inputs.n_lights)
+        listed = list_lengths(env["positions"], env["clusters"], env["listed"])
+        counts |= cluster_counts(listed, n_cells(env["grid"], inputs.viewport), inputs.n_lights)
+        counts |= approximation_counts(listed, lengths)
         counts |= assign_counts(env["assign_counts"], inputs.n_lights, branching)
         rows = walk_rows(env["assign_counts"])
         if technique.one_slice:
@@ -313,7 +324,8 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
         light_runs = int(env["assign"].total)
         n_tests = inputs.n_lights * inputs.positions(with_hidden=False).n_visible_runs
         counts |= {"lights": inputs.n_lights, "leaf_tests": n_tests, "light_runs": light_runs}
-    structures = [value for name, value in env.items() if name not in _NO_STRUCTURES]
+    # By identity: lists that nothing was taken off are those that were assigned.
+    structures = list({id(value): value for name, value in env.items() if name not in _NO_STRUCTURES}.values())
     counts |= memory_counts(env["gbuffer"], structures, fragments.n_samples, counts.get("light_cluster_pairs", 0))
     counts |= gbuffer_traffic(technique.reads_gbuffer, counts)
     frame_counts = FrameCounts(counts, lengths.of_block, lengths.n_solid_blocks, rows, light_runs, branching, sizes)

@@ -147,6 +147,13 @@ PARAMETERS: dict[str, Parameter] = {
             choices=("float32", "float16", "bfloat16"),
         ),
         Parameter("light_cutoff", 0.0, "lights reach only where their window is above this", low=0.0, high=0.99),
+        Parameter(
+            "approximate",
+            0.0,
+            "lights that vary by at most this over a cluster, as a share of all light there, are evaluated once for it",
+            low=0.0,
+            high=1.0,
+        ),
     )
 }
 
@@ -154,8 +161,11 @@ _TILES = ("tile_px", "tile_px_x", "tile_px_y", "grid")
 _SLICES = ("depth_slices", "depth_scheme")
 _CLUSTERS = ("bounds", "cull", "unique", "normal_bins", "normal_cones")
 _SHADING = ("gbuffer", "light_cutoff")
-_BRUTE_FORCE = ("batch", *_CLUSTERS, *_SHADING)
-_BY_TREE = (*_TILES, *_SLICES, "branching", "batch", *_CLUSTERS, "leaf_test", *_SHADING)
+_BRUTE_FORCE = ("batch", *_CLUSTERS, *_SHADING, "approximate")
+_BY_TREE = (*_TILES, *_SLICES, "branching", "batch", *_CLUSTERS, "leaf_test", *_SHADING, "approximate")
+
+ACCURACY = ("gbuffer", "light_cutoff", "approximate")
+"""Parameters that change the image: their defaults are exact."""
 
 TECHNIQUES: dict[str, tuple[str, ...]] = {
     "forward": ("prepass", "batch", *_SHADING),
@@ -207,6 +217,14 @@ class Configuration:
     def __str__(self) -> str:
         changed = [f"{name}={value}" for name, value in self.items if value != default_value(self.technique, name)]
         return " ".join([self.technique, *changed])
+
+    def exact(self) -> Configuration:
+        """The same without what trades accuracy for speed."""
+        return self.replaced(**{name: PARAMETERS[name].default for name in ACCURACY if name in self.params})
+
+    @property
+    def is_exact(self) -> bool:
+        return self == self.exact()
 
     def replaced(self, **changes: Value) -> Configuration:
         """The same configuration with some values changed."""

@@ -30,6 +30,21 @@ class Surface(eqx.Module):
     shininess: Float[Array, "*s"]
 
 
+class ClusterLight(eqx.Module):
+    """What lights add that are evaluated once a cluster: irradiance and highlight; red, green and blue of each."""
+
+    irradiance: tuple[Float[Array, " clusters"], ...]
+    highlight: tuple[Float[Array, " clusters"], ...]
+
+    def reflected_by(self, part: GBuffer, cluster: Int[Array, " blocks"]) -> tuple[Float[Array, "blocks 32"], ...]:
+        """Red, green and blue that the samples of each block reflect."""
+        return tuple(
+            base.astype(jnp.float32) * irradiance[cluster][:, None]
+            + part.specular.astype(jnp.float32) * highlight[cluster][:, None]
+            for base, irradiance, highlight in zip(part.base_colour, self.irradiance, self.highlight, strict=True)
+        )
+
+
 def direction_to_eye(position_m: tuple[Float[Array, "*s"], ...]) -> tuple[Float[Array, "*s"], ...]:
     """Unit vectors to the eye, which is the origin of view space."""
     x_m, y_m, z_m = position_m
@@ -160,6 +175,7 @@ def shade(
     light_cutoff: Float[Array, ""],
     batch: int,
     transparent: bool = False,
+    cluster_light: ClusterLight | None = None,
 ) -> Image:
     """Shade every valid sample with its cluster's lights: linear red, green and blue, 0 where invalid.
 
@@ -169,6 +185,7 @@ def shade(
     **Arguments:**
 
     - `transparent`: shade the transparent runs, and return those; else the solid ones, and return the visible.
+    - `cluster_light`: what is not on the lists but adds to all samples of a cluster.
     """
     capacity = clusters.block_run.shape[0]
     chunk = chunk_blocks(capacity, batch)
@@ -211,6 +228,9 @@ def shade(
         offset, count = block_offset[block], jnp.where(in_use, block_count[block], 0)
         part = jax.tree.map(lambda channel: channel[run], gbuffer)
         sums = tuple(e.astype(jnp.float32) for e in part.emissive)
+        if cluster_light is not None:
+            once = cluster_light.reflected_by(part, clusters.block_cluster[block])
+            sums = tuple(s + a for s, a in zip(sums, once, strict=True))
         k = jnp.int32(0)
         for width, narrower in zip(widths, (*widths[1:], 0), strict=True):
             # Not the first one's length: very long lists are not in order among themselves.

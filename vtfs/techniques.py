@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from vtfs.cluster_grid import ClusterGrid
+from vtfs.cluster_light import split_lists
 from vtfs.clusters import Bounds, Clusters, Unique, everything, form_clusters
 from vtfs.gbuffer import GBuffer, LayerTable, Positions
 from vtfs.light_assignment.brute_force import assign_brute_force
@@ -30,7 +31,7 @@ from vtfs.light_volumes import LightPixels, draw_light_volumes, shade_light_volu
 from vtfs.morton import morton_codes
 from vtfs.normal_cones import Components, ConeKind
 from vtfs.parameters import Configuration
-from vtfs.shading import Image, blend_layers, chunk_blocks, shade
+from vtfs.shading import ClusterLight, Image, blend_layers, chunk_blocks, shade
 
 _TESTS_AT_ONCE = {"cpu": 2**19, "gpu": 2**22}
 """`batch = 0` means all queries at once, as far as their rows of boxes stay in the cache of a CPU (12 MB) or leave
@@ -42,6 +43,7 @@ class Plan:
     """What is static in a frame's programs: it fixes array shapes. A stage sees only what it names.
 
     - `two_lists`: transparent samples have lists of their own.
+    - `approximates`: lights that vary little over a cluster are evaluated once for it.
     - `cells`, `blocks`, `pairs`: rounded capacities (see `frame.Sizes`).
     """
 
@@ -52,6 +54,7 @@ class Plan:
     unique: Unique = "page_table"
     normal_cones: ConeKind = "implicit"
     sections: bool = False
+    approximates: bool = False
     branching: int = 0
     batch: int = 0
     cells: int = 0
@@ -63,8 +66,9 @@ class Plan:
 class Stage:
     """One step of a frame, timed apart.
 
-    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`) and earlier
-      stages.
+    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`, `approximate`) and
+      earlier stages. `listed` are the lists as assigned, `assign` those without what is evaluated once a cluster, and
+      `cluster_light` is that, or None.
     - `statics`: the fields of `Plan` that its program depends on.
     """
 
@@ -105,8 +109,10 @@ class Technique:
             cull=params.get("cull", "box"),  # type: ignore[arg-type]
             leaf_test=params.get("leaf_test", "sphere"),  # type: ignore[arg-type]
             unique=params.get("unique", "page_table"),  # type: ignore[arg-type]
-            normal_cones=params.get("normal_cones", "implicit"),  # type: ignore[arg-type]
+            # How much light varies depends on where samples face, so that is found out.
+            normal_cones="explicit" if approximates(config) else params.get("normal_cones", "implicit"),  # type: ignore[arg-type]
             sections=needs_sections(params.get("cull", "box")),  # type: ignore[arg-type]
+            approximates=approximates(config),
             branching=int(params.get("branching", 0)),
             batch=int(params.get("batch", 0)),
         )
@@ -115,9 +121,15 @@ class Technique:
         """Are fragments shaded that end up hidden?"""
         return config.params.get("prepass", "off" if self.without_prepass else "on") == "off"
 
-    def stages_of(self, has_transparent: bool) -> tuple[Stage, ...]:
+    def stages_of(self, has_transparent: bool, approximates: bool) -> tuple[Stage, ...]:
         """The stages of a frame; that of transparent samples only where there are any."""
-        return tuple(stage for stage in self.stages if has_transparent or stage.name != "shade_transparent")
+        left_out = {"shade_transparent": not has_transparent, "approximate": not approximates}
+        return tuple(stage for stage in self.stages if not left_out.get(stage.name, False))
+
+
+def approximates(config: Configuration) -> bool:
+    """Are some lights evaluated once a cluster?"""
+    return float(config.params.get("approximate", 0)) > 0
 
 
 Assigned = tuple[LightLists, AssignCounts]
@@ -193,10 +205,32 @@ def volume_chunk(pairs: int, batch: int) -> int:
     return min(chunk_blocks(pairs, batch), _MAX_VOLUME_RUNS)
 
 
+_PAIRS_AT_ONCE = {"cpu": 2**15, "gpu": 2**20}
+
+
+def _approximate(
+    plan: Plan,
+    gbuffer: GBuffer,
+    lights: ViewLights,
+    light_cutoff,
+    approximate,
+    clusters: Clusters,
+    lists: LightLists,
+) -> tuple[LightLists, ClusterLight]:
+    chunk = min(plan.pairs, _PAIRS_AT_ONCE.get(jax.default_backend(), 2**20))
+    return split_lists(gbuffer, clusters, lists, lights.row, light_cutoff, approximate, chunk)
+
+
 def _shade(
-    plan: Plan, gbuffer: GBuffer, lights: ViewLights, light_cutoff, clusters: Clusters, lists: LightLists
+    plan: Plan,
+    gbuffer: GBuffer,
+    lights: ViewLights,
+    light_cutoff,
+    clusters: Clusters,
+    lists: LightLists,
+    cluster_light: ClusterLight | None = None,
 ) -> Image:
-    return shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch)
+    return shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, cluster_light=cluster_light)
 
 
 def _shade_transparent(
@@ -208,8 +242,9 @@ def _shade_transparent(
     solid: Image,
     clusters: Clusters,
     lists: LightLists,
+    cluster_light: ClusterLight | None = None,
 ) -> Image:
-    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, transparent=True)
+    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, cluster_light)
     return blend_layers(solid, colour, layers)
 
 
@@ -249,12 +284,15 @@ _ASSIGN_BY_TREE = (
     Stage("assign", _assign_tree, ("build_tree", "clusters"), ("branching", "batch", "pairs", "cull", "leaf_test")),
 )
 _LIGHTS = ("lights", "light_cutoff")
+_APPROXIMATE = Stage(
+    "approximate", _approximate, ("gbuffer", *_LIGHTS, "approximate", "clusters", "listed"), ("pairs",)
+)
 _SHADE = (
-    Stage("shade_opaque", _shade, ("gbuffer", *_LIGHTS, "clusters", "assign"), ("batch",)),
+    Stage("shade_opaque", _shade, ("gbuffer", *_LIGHTS, "clusters", "assign", "cluster_light"), ("batch",)),
     Stage(
         "shade_transparent",
         _shade_transparent,
-        ("gbuffer", "layers", *_LIGHTS, "shade_opaque", "clusters", "assign"),
+        ("gbuffer", "layers", *_LIGHTS, "shade_opaque", "clusters", "assign", "cluster_light"),
         ("batch",),
     ),
 )
@@ -273,8 +311,8 @@ def _deferred(name: str, stencil: bool) -> Technique:
     return Technique(name, stages, lists="light_volumes", reads_gbuffer="per_light")
 
 
-_TILED = (_CLUSTERS, _ASSIGN_BRUTE_FORCE, *_SHADE)
-_CLUSTERED = (_CLUSTERS, *_ASSIGN_BY_TREE, *_SHADE)
+_TILED = (_CLUSTERS, _ASSIGN_BRUTE_FORCE, _APPROXIMATE, *_SHADE)
+_CLUSTERED = (_CLUSTERS, *_ASSIGN_BY_TREE, _APPROXIMATE, *_SHADE)
 
 REGISTRY: dict[str, Technique] = {
     technique.name: technique
