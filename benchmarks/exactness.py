@@ -20,7 +20,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tests import oracles
-from tests.strategies import LIGHT_KINDS, a_camera, adversarial_lights, lights_in_view, random_samples, samples_at
+from tests.strategies import (
+    LIGHT_KINDS,
+    a_camera,
+    adversarial_lights,
+    lights_in_view,
+    random_samples,
+    samples_at,
+    through,
+)
 from tests.strategies import surface_samples as smooth_samples
 from vtfs.camera import Camera, Lens, Viewport
 from vtfs.frame import NO_SIZES, FrameInputs, run_stages
@@ -88,16 +96,6 @@ def draw_scene(seed: int) -> tuple[ViewSamples, Lights]:
     kinds = LIGHT_KINDS if rng.random() < 0.5 else (LIGHT_KINDS[rng.integers(len(LIGHT_KINDS))],)
     lights = adversarial_lights(samples, N_LIGHTS, kinds, int(rng.integers(2**31)))
     return samples, as_spots(samples, lights, rng) if rng.random() < 0.5 else lights
-
-
-def through(samples: ViewSamples, lens: Lens) -> ViewSamples:
-    """The same depths seen through another lens."""
-    camera = replace(samples.camera, lens=lens)
-    slope = np.stack(np.meshgrid(*camera.pixel_slopes()), axis=-1)
-    width = 1.0 if camera.is_orthographic else -samples.position_m[..., 2:].astype(np.float64)
-    position_m = samples.position_m.copy()
-    position_m[..., :2] = np.where(samples.valid[..., None], slope * width, 0)
-    return replace(samples, camera=camera, position_m=position_m)
 
 
 def as_spots(samples: ViewSamples, lights: Lights, rng: np.random.Generator) -> Lights:

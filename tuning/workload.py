@@ -39,7 +39,7 @@ from vtfs.lights import Lights
 from vtfs.op_counts import OpCounts
 from vtfs.parameters import Configuration, configuration
 from vtfs.reference import forward_reference, image_error
-from vtfs.techniques import REGISTRY, approximates
+from vtfs.techniques import REGISTRY
 from vtfs.view_samples import ViewSamples
 
 log = logging.getLogger("vtfs.workload")
@@ -219,7 +219,7 @@ class SceneWorkload:
         None where `env` is empty: of what has lost, and where the frame is one stage.
         """
         technique = REGISTRY[config.technique]
-        stages = technique.stages_of(self._inputs[0].has_transparent, approximates(config)) if env else ()
+        stages = technique.stages_of(technique.plan(config), self._inputs[0].has_transparent) if env else ()
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:

@@ -177,7 +177,7 @@ def _centres(gbuffer: GBuffer, clusters: Clusters) -> Surface:
     position_m = (x_m, y_m, z_m)
     return Surface(
         position_m,
-        direction_to_eye(position_m),
+        direction_to_eye(position_m, gbuffer.positions.is_parallel),
         (cones.x, cones.y, cones.z),
         (white, white, white),
         white,

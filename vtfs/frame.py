@@ -184,7 +184,7 @@ def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
 
 def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable[..., Any]:
     """All stages fused in one program: from the inputs to the image and whether anything overflowed."""
-    return _fused(REGISTRY[technique].stages_of(has_transparent, plan.approximates), plan)
+    return _fused(REGISTRY[technique].stages_of(plan, has_transparent), plan)
 
 
 @functools.cache
@@ -223,7 +223,7 @@ def run_stages(
         grid_keys *= 2
     fitting = Sizes(rounded_up("cells", grid_keys), rounded_up("blocks", n_runs), rounded_up("pairs", 0))
     sizes = fitting.covering(sizes) if sizes else fitting
-    for stage in technique.stages_of(inputs.has_transparent, approximates(config)):
+    for stage in technique.stages_of(technique.plan(config), inputs.has_transparent):
         while True:
             plan = narrowed(stage, planned(config, sizes))
             result = stage_program(stage, plan)(*(env[name] for name in stage.needs))

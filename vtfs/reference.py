@@ -65,7 +65,11 @@ def _shade(samples: ViewSamples, box: tuple[slice, slice], valid: np.ndarray, vi
     to_unit = to / np.sqrt(distance2)
     window = (1 - (distance2 / view.range_m[light] ** 2) ** 2) ** 2
     n = normal[sample].T
-    half = to_unit - (position / np.linalg.norm(position, axis=1, keepdims=True))[sample].T
+    if samples.camera.is_orthographic:
+        to_eye = np.broadcast_to([0.0, 0.0, 1.0], position.shape)
+    else:
+        to_eye = -position / np.linalg.norm(position, axis=1, keepdims=True)
+    half = to_unit + to_eye[sample].T
     length = np.sqrt(np.einsum("cp,cp->p", half, half))
     # Light straight from behind the sample has no half vector, and no highlight.
     n_dot_h = np.maximum(np.einsum("cp,cp->p", n, half) / np.where(length > 0, length, 1), 0)

@@ -15,10 +15,11 @@ import numpy as np
 from vtfs.cache import cached
 from vtfs.camera import CameraPath, Viewport, default_cameras, load_cameras
 from vtfs.gallery import GALLERY, build_scene
+from vtfs.gbuffer_files import load_gbuffer
 from vtfs.input_error import InputError
 from vtfs.lights import Lights, load_lights, scatter_lights
 from vtfs.scene import Scene, load_scene
-from vtfs.view_samples import Tracer, ViewSamples, load_gbuffer, trace_view_samples
+from vtfs.view_samples import Tracer, ViewSamples, trace_view_samples
 
 log = logging.getLogger("vtfs.scene_setup")
 

@@ -45,9 +45,11 @@ class ClusterLight(eqx.Module):
         )
 
 
-def direction_to_eye(position_m: tuple[Float[Array, "*s"], ...]) -> tuple[Float[Array, "*s"], ...]:
-    """Unit vectors to the eye, which is the origin of view space."""
+def direction_to_eye(position_m: tuple[Float[Array, "*s"], ...], is_parallel: bool) -> tuple[Float[Array, "*s"], ...]:
+    """Unit vectors to the eye: the origin of view space, or in a parallel view at infinity along z."""
     x_m, y_m, z_m = position_m
+    if is_parallel:
+        return jnp.zeros_like(x_m), jnp.zeros_like(y_m), jnp.ones_like(z_m)
     inverse = -jax.lax.rsqrt(x_m * x_m + y_m * y_m + z_m * z_m + _TINY)
     return x_m * inverse, y_m * inverse, z_m * inverse
 
@@ -55,7 +57,7 @@ def direction_to_eye(position_m: tuple[Float[Array, "*s"], ...]) -> tuple[Float[
 def surface_of(part: GBuffer) -> Surface:
     """What is lit, in the precision of the channels."""
     position_m = (part.positions.x_m, part.positions.y_m, part.positions.z_m)
-    to_eye = direction_to_eye(position_m)
+    to_eye = direction_to_eye(position_m, part.positions.is_parallel)
     return Surface(position_m, to_eye, part.normal, part.base_colour, part.specular, part.shininess)
 
 

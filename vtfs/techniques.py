@@ -121,9 +121,9 @@ class Technique:
         """Are fragments shaded that end up hidden?"""
         return config.params.get("prepass", "off" if self.without_prepass else "on") == "off"
 
-    def stages_of(self, has_transparent: bool, approximates: bool) -> tuple[Stage, ...]:
+    def stages_of(self, plan: Plan, has_transparent: bool) -> tuple[Stage, ...]:
         """The stages of a frame; that of transparent samples only where there are any."""
-        left_out = {"shade_transparent": not has_transparent, "approximate": not approximates}
+        left_out = {"shade_transparent": not has_transparent, "approximate": not plan.approximates}
         return tuple(stage for stage in self.stages if not left_out.get(stage.name, False))
 
 

@@ -160,5 +160,5 @@ def test_without_approximation_the_frame_has_no_such_stage():
     for name, technique in REGISTRY.items():
         plan = technique.plan(configuration(name))
         assert not plan.approximates
-        assert "approximate" not in [stage.name for stage in technique.stages_of(True, plan.approximates)]
+        assert "approximate" not in [stage.name for stage in technique.stages_of(plan, True)]
     assert technique.plan(configuration(name, {"approximate": 0.5})).approximates

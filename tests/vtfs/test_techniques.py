@@ -9,7 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import oracles
-from tests.strategies import SMALL, WIDE, a_camera, layered_samples, nearby_lights, no_lights, seeds, surface_samples
+from tests.strategies import (
+    SMALL,
+    WIDE,
+    a_camera,
+    layered_samples,
+    nearby_lights,
+    no_lights,
+    seeds,
+    surface_samples,
+    through,
+)
+from vtfs.camera import Lens
 from vtfs.frame import FrameInputs, image_on_host, render, run_stages
 from vtfs.parameters import TECHNIQUES, configuration
 from vtfs.reference import forward_reference, largest_relative_difference
@@ -110,6 +121,14 @@ def test_stages_by_themselves_make_the_image_of_the_frame(technique):
     env, _ = run_stages(a_config(technique), inputs)
     by_stages = image_on_host(env["shade_transparent"], inputs).astype(np.float64)
     assert largest_relative_difference(render(a_config(technique), inputs), by_stages, samples.valid) < 1e-6
+
+
+@pytest.mark.parametrize("technique", ["deferred", "volume_tiled_bvh"])
+def test_a_parallel_view_is_shaded_with_its_eye_at_infinity(technique):
+    samples = through(surface_samples(a_camera(), 7), Lens(orthographic_height_m=7.5))
+    lights = nearby_lights(samples, 37, 7)
+    image = check(a_config(technique), samples, lights)
+    assert largest_relative_difference(image, forward_reference(samples, lights), samples.valid) < 1e-4
 
 
 @pytest.mark.parametrize("technique", ["forward", "volume_tiled_bvh"])
