@@ -78,7 +78,9 @@ class SceneWorkload:
         self._path = path
         self._compiles = compiles
         self._objective = objective
-        self._inputs = [FrameInputs(samples, path.lights) for samples in path.samples]
+        self._inputs = [
+            FrameInputs(samples, path.lights, frame) for samples, frame in zip(path.samples, path.frames, strict=True)
+        ]
         self._reference: np.ndarray | None = None
         self._counted: dict[tuple[Configuration, int], FrameCounts] = {}
         self.device = device_name()

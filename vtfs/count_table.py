@@ -29,7 +29,7 @@ def count_frames(
     """Exact counts of every configuration on every frame, frame by frame (samples are traced once)."""
     rows: list[CountRow] = []
     for frame in frames:
-        inputs = FrameInputs(setup.samples(frame), setup.lights)
+        inputs = FrameInputs(setup.samples(frame), setup.lights, frame)
         counted: dict[Configuration, FrameCounts] = {}
         for config in configs:
             # A batch changes how the work is cut up, not the lists.

@@ -14,8 +14,10 @@ import numpy as np
 from vtfs.cluster_grid import cluster_grid, configured_grid, n_cells, n_keys, tile_and_slices
 from vtfs.gbuffer import RUN_WIDTH_PX, Fragments, GBuffer, LayerTable, Positions, from_runs
 from vtfs.input_error import InputError
-from vtfs.light_lists import view_lights
+from vtfs.light_assignment.light_tree import reduce_lights, sort_lights
+from vtfs.light_lists import ViewLights, view_lights
 from vtfs.lights import Lights
+from vtfs.morton import morton_codes
 from vtfs.op_counts import (
     ListLengths,
     OpCounts,
@@ -38,7 +40,9 @@ from vtfs.techniques import REGISTRY, Plan, Stage, approximates, volume_chunk, w
 from vtfs.view_samples import ViewSamples
 
 _BRUTE_FORCE_WORD = 32
-_NO_STRUCTURES = ("positions", "gbuffer", "normals", "grid", "light_cutoff", "approximate")
+_NO_STRUCTURES = (
+    "positions", "gbuffer", "normals", "grid", "light_cutoff", "approximate", "frame", "resort_every",
+)  # fmt: skip
 
 
 class CapacityError(InputError):
@@ -85,10 +89,23 @@ def rounded_up(name: str, needed: int) -> int:
 
 
 class FrameInputs:
-    """One frame on the device: view samples and lights, uploaded once and used by every configuration."""
+    """One frame on the device: view samples and lights, uploaded once and used by every configuration.
 
-    def __init__(self, samples: ViewSamples, lights: Lights):
+    - `frame`: its number on the path: where `resort_every` divides it, the light tree is sorted.
+    - `earlier_lights`: where lights were in an earlier frame, in its view space; where they are now unless given.
+    """
+
+    def __init__(
+        self,
+        samples: ViewSamples,
+        lights: Lights,
+        frame: int = 0,
+        earlier_lights: Callable[[int], ViewLights] | None = None,
+    ):
         self.samples = samples
+        self.frame = frame
+        self._earlier_lights = earlier_lights
+        self._orders: dict[tuple[int, float], jax.Array] = {}
         self.camera = samples.camera
         self.viewport = samples.camera.viewport
         self.lights = view_lights(lights, samples.camera)
@@ -123,6 +140,13 @@ class FrameInputs:
             self._gbuffers[key] = self.fragments(with_hidden).gbuffer(self.positions(with_hidden), precision)
         return self._gbuffers[key]
 
+    def order_of(self, frame: int, light_cutoff: float) -> jax.Array:
+        """The lights in Morton order of an earlier frame: what that frame left for those after it."""
+        if (frame, light_cutoff) not in self._orders:
+            lights = self._earlier_lights(frame) if self._earlier_lights else self.lights
+            self._orders[frame, light_cutoff] = _morton_order(lights, np.float32(light_cutoff))
+        return self._orders[frame, light_cutoff]
+
     def seen(self) -> np.ndarray:
         """Which pixels show anything: bool `[h, w]`."""
         layers = [layer.samples.valid for layer in self.samples.layers.transparent]
@@ -142,6 +166,11 @@ class FrameInputs:
             "approximate": np.float32(params.get("approximate", 0)),
             "cluster_light": None,
         }
+        resort_every = int(params.get("resort_every", 1))
+        if resort_every > 1:
+            last_sorted = self.frame - self.frame % resort_every
+            env["old_order"] = self.order_of(last_sorted, float(params["light_cutoff"]))
+            env |= {"frame": np.int32(self.frame), "resort_every": np.int32(resort_every)}
         if technique.lists == "clusters":
             env["grid"] = configured_grid(self.camera, params, self.deepest_m, technique.one_slice)
             # Only where they are read: each precision of the G-buffer would compile the clusters again.
@@ -151,6 +180,12 @@ class FrameInputs:
         elif technique.lists == "light_volumes":  # for its pixels
             env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
         return env
+
+
+@jax.jit
+def _morton_order(lights: ViewLights, light_cutoff) -> jax.Array:
+    spheres = lights.spheres(light_cutoff)
+    return sort_lights(morton_codes(spheres, *reduce_lights(spheres)))
 
 
 def planned(config: Configuration, sizes: Sizes) -> Plan:

@@ -101,6 +101,13 @@ PARAMETERS: dict[str, Parameter] = {
         ),
         Parameter("branching", 32, "children of a node of the light tree", choices=(2, 4, 8, 16, 32, 64)),
         Parameter(
+            "resort_every",
+            1,
+            "frames from one sort of the light tree to the next; between them its order is kept and its boxes refitted",
+            low=1,
+            high=64,
+        ),
+        Parameter(
             "batch",
             0,
             "queries in one chunk: clusters when assigning, samples when shading; "
@@ -162,7 +169,7 @@ _SLICES = ("depth_slices", "depth_scheme")
 _CLUSTERS = ("bounds", "cull", "unique", "normal_bins", "normal_cones")
 _SHADING = ("gbuffer", "light_cutoff")
 _BRUTE_FORCE = ("batch", *_CLUSTERS, *_SHADING, "approximate")
-_BY_TREE = (*_TILES, *_SLICES, "branching", "batch", *_CLUSTERS, "leaf_test", *_SHADING, "approximate")
+_BY_TREE = (*_TILES, *_SLICES, "branching", "resort_every", "batch", *_CLUSTERS, "leaf_test", *_SHADING, "approximate")
 
 ACCURACY = ("gbuffer", "light_cutoff", "approximate")
 """Parameters that change the image: their defaults are exact."""

@@ -22,6 +22,7 @@ from vtfs.light_assignment.light_tree import (
     LightTree,
     assign_tree,
     build_light_tree,
+    order_lights,
     reduce_lights,
     sort_lights,
 )
@@ -43,6 +44,7 @@ class Plan:
     """What is static in a frame's programs: it fixes array shapes. A stage sees only what it names.
 
     - `two_lists`: transparent samples have lists of their own.
+    - `keeps_order`: the light tree is sorted in some frames only.
     - `approximates`: lights that vary little over a cluster are evaluated once for it.
     - `cells`, `blocks`, `pairs`: rounded capacities (see `frame.Sizes`).
     """
@@ -55,6 +57,7 @@ class Plan:
     normal_cones: ConeKind = "implicit"
     sections: bool = False
     approximates: bool = False
+    keeps_order: bool = False
     branching: int = 0
     batch: int = 0
     cells: int = 0
@@ -66,9 +69,9 @@ class Plan:
 class Stage:
     """One step of a frame, timed apart.
 
-    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`, `approximate`) and
-      earlier stages. `listed` are the lists as assigned, `assign` those without what is evaluated once a cluster, and
-      `cluster_light` is that, or None.
+    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`, `approximate`, and
+      for kept orders `old_order`, `frame`, `resort_every`) and earlier stages. `listed` are the lists as assigned,
+      `assign` those without what is evaluated once a cluster, and `cluster_light` is that, or None.
     - `statics`: the fields of `Plan` that its program depends on.
     """
 
@@ -113,6 +116,7 @@ class Technique:
             normal_cones="explicit" if approximates(config) else params.get("normal_cones", "implicit"),  # type: ignore[arg-type]
             sections=needs_sections(params.get("cull", "box")),  # type: ignore[arg-type]
             approximates=approximates(config),
+            keeps_order=int(params.get("resort_every", 1)) > 1,
             branching=int(params.get("branching", 0)),
             batch=int(params.get("batch", 0)),
         )
@@ -122,9 +126,12 @@ class Technique:
         return config.params.get("prepass", "off" if self.without_prepass else "on") == "off"
 
     def stages_of(self, plan: Plan, has_transparent: bool) -> tuple[Stage, ...]:
-        """The stages of a frame; that of transparent samples only where there are any."""
+        """The stages of a frame; that of transparent samples only where there are any, and one that sorts lights or not
+        in place of three where their order is kept."""
         left_out = {"shade_transparent": not has_transparent, "approximate": not plan.approximates}
-        return tuple(stage for stage in self.stages if not left_out.get(stage.name, False))
+        left_out |= dict.fromkeys(("reduce", "morton"), plan.keeps_order)
+        stages = (_SORT_OR_KEEP if stage is _SORT and plan.keeps_order else stage for stage in self.stages)
+        return tuple(stage for stage in stages if not left_out.get(stage.name, False))
 
 
 def approximates(config: Configuration) -> bool:
@@ -180,6 +187,10 @@ def _morton(plan: Plan, lights: ViewLights, light_cutoff, box):
 
 def _sort(plan: Plan, codes):
     return sort_lights(codes)
+
+
+def _sort_or_keep(plan: Plan, lights: ViewLights, light_cutoff, old_order, frame, resort_every):
+    return order_lights(lights.spheres(light_cutoff), old_order, frame, resort_every)
 
 
 def _build_tree(plan: Plan, lights: ViewLights, light_cutoff, order) -> LightTree:
@@ -276,10 +287,12 @@ _CLUSTERS = Stage(
 _ASSIGN_BRUTE_FORCE = Stage(
     "assign", _assign_brute_force, ("lights", "light_cutoff", "clusters"), ("batch", "pairs", "cull")
 )
+_SORT = Stage("sort", _sort, ("morton",))
+_SORT_OR_KEEP = Stage("sort", _sort_or_keep, ("lights", "light_cutoff", "old_order", "frame", "resort_every"))
 _ASSIGN_BY_TREE = (
     Stage("reduce", _reduce, ("lights", "light_cutoff")),
     Stage("morton", _morton, ("lights", "light_cutoff", "reduce")),
-    Stage("sort", _sort, ("morton",)),
+    _SORT,
     Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",)),
     Stage("assign", _assign_tree, ("build_tree", "clusters"), ("branching", "batch", "pairs", "cull", "leaf_test")),
 )

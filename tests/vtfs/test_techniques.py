@@ -164,7 +164,7 @@ def test_the_registry_and_the_parameters_name_the_same_techniques():
     for name, technique in REGISTRY.items():
         assert technique.name == name and technique.stages[-1].name == "shade_transparent"
         known = {"positions", "gbuffer", "layers", "grid", "normals", "lights", "light_cutoff"}
-        known |= {"approximate", "cluster_light", "listed"}
+        known |= {"approximate", "cluster_light", "listed", "old_order", "frame", "resort_every"}
         for stage in technique.stages:
             assert set(stage.needs) <= known
             known.add(stage.name)
