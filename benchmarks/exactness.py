@@ -128,9 +128,9 @@ def reaching(samples: ViewSamples, lights: Lights) -> tuple[np.ndarray, np.ndarr
     direction = lights.direction @ samples.camera.view_from_world[:3, :3].T
     to_light = [view_m[None, :, c] - position_m[:, None, c] for c in range(3)]
     distance = np.sqrt(sum(t * t for t in to_light))
-    reaches = (distance < lights.range_m) & (
-        np.maximum(0, 1 - (distance / np.maximum(lights.range_m, 1e-300)) ** 4) > 0
-    )
+    # A window above 0 in float64: just inside the range it may be 0 by rounding, as in shading.
+    ratio = np.minimum(distance / np.maximum(lights.range_m, 1e-30), 1)
+    reaches = (lights.range_m > 0) & (np.maximum(0, 1 - ratio**4) > 0)
     along = -sum(t * direction[:, c] for c, t in enumerate(to_light))
     reaches &= ~lights.is_spot | (along > lights.cos_outer * distance)
     return reaches, reaches & (sum(t * normal[:, c, None] for c, t in enumerate(to_light)) > 0)

@@ -18,6 +18,7 @@ from tuning.compiles import Compiles
 from tuning.measurement import Measurement, Outcome
 from tuning.timing import interleaved_ms, repeats_ms, timed_ms
 from vtfs.cache import cached
+from vtfs.cell_maps import CellMaps, cell_maps
 from vtfs.device import device_name, versions
 from vtfs.frame import (
     NO_SIZES,
@@ -36,7 +37,7 @@ from vtfs.frame import (
 )
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
-from vtfs.op_counts import OpCounts
+from vtfs.op_counts import ListLengths, OpCounts
 from vtfs.parameters import Configuration, configuration
 from vtfs.reference import forward_reference, image_error
 from vtfs.techniques import REGISTRY
@@ -152,9 +153,17 @@ class SceneWorkload:
         """Which pixels of that frame have a sample."""
         return self._inputs[0].seen()
 
-    def list_lengths(self, config: Configuration) -> np.ndarray:
-        """Lights listed for each pixel of that frame."""
-        return count(config, self._inputs[0])[1].of_sample
+    def solid(self) -> np.ndarray:
+        """Which of them have a solid one."""
+        return self._inputs[0].samples.valid
+
+    def list_lengths(self, config: Configuration) -> ListLengths:
+        """Lights listed for each pixel and each cell of that frame."""
+        return count(config, self._inputs[0])[1]
+
+    def cell_maps(self, config: Configuration) -> CellMaps | None:
+        """The cells of that frame; None where the technique has none."""
+        return cell_maps(config, self._inputs[0])
 
     def reference(self) -> np.ndarray:
         """The float64 image of the frame with the most work."""
