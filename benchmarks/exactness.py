@@ -38,7 +38,8 @@ from vtfs.lights import Lights, cone_cosines
 from vtfs.parameters import Configuration, Value, configuration
 from vtfs.view_samples import ViewSamples
 
-TREE: dict[str, Value] = {"branching": 8, "batch": 1024}
+TREE: dict[str, Value] = {"branching": 8, "batch": 1024, "assigner": "published"}
+GROUPS: dict[str, Value] = {"branching": 8, "batch": 1024, "assigner": "coarse_to_fine"}
 CASES: tuple[tuple[str, dict[str, Value]], ...] = (
     ("deferred", {"batch": 1024}),
     ("deferred_stencil", {"batch": 1024}),
@@ -49,6 +50,7 @@ CASES: tuple[tuple[str, dict[str, Value]], ...] = (
     ("tiled_deferred", {"batch": 1024, "bounds": "explicit", "cull": "frustum", "normal_cones": "explicit"}),
     ("volume_tiled", {"batch": 1024}),
     ("volume_tiled", {"batch": 1024, "cull": "frustum"}),
+    ("volume_tiled", {"batch": 1024, "assigner": "coarse_to_fine"}),
     ("volume_tiled_bvh", TREE),
     ("volume_tiled_bvh", {**TREE, "branching": 32, "bounds": "explicit"}),
     ("volume_tiled_bvh", {**TREE, "branching": 2, "cull": "frustum", "unique": "sort"}),
@@ -56,6 +58,9 @@ CASES: tuple[tuple[str, dict[str, Value]], ...] = (
     ("volume_tiled_bvh", {**TREE, "bounds": "packed", "leaf_test": "box"}),
     ("volume_tiled_bvh", {**TREE, "bounds": "depth_range", "cull": "planes"}),
     ("volume_tiled_bvh", {**TREE, "normal_bins": 2}),
+    ("volume_tiled_bvh", GROUPS),
+    ("volume_tiled_bvh", {**GROUPS, "bounds": "explicit", "cull": "frustum"}),
+    ("volume_tiled_bvh", {**GROUPS, "normal_bins": 2}),
 )
 """Techniques that differ in what is rasterised make the same lists: `tiled_forward_prez` those of `tiled_deferred`,
 `clustered_deferred` and `clustered_forward` those of `volume_tiled_bvh`; `forward` has none."""
@@ -242,9 +247,9 @@ def every_tile_size(tallies: dict[str, Tally]) -> None:
         for tile_px in range(2, 257):
             for technique, params in (
                 ("tiled_deferred", {}),
-                ("volume_tiled_bvh", {"depth_slices": 24, "branching": 8}),
+                ("volume_tiled_bvh", {"depth_slices": 24, **TREE}),
             ):
-                config = configuration(technique, {"tile_px": tile_px, "batch": 1024, **params})
+                config = configuration(technique, {"batch": 1024, **params, "tile_px": tile_px})
                 check(
                     tallies[f"{width_px}x{height_px}, tiles of 2 to 256, {technique}"], config, inputs, reaches, "tiles"
                 )

@@ -14,8 +14,9 @@ import numpy as np
 from vtfs.cluster_grid import cluster_grid, configured_grid, n_cells, n_keys, tile_and_slices
 from vtfs.gbuffer import RUN_WIDTH_PX, Fragments, GBuffer, LayerTable, Positions, from_runs
 from vtfs.input_error import InputError
+from vtfs.light_assignment.brute_force import every_pair
 from vtfs.light_assignment.light_tree import reduce_lights, sort_lights
-from vtfs.light_lists import ViewLights, view_lights
+from vtfs.light_lists import AssignCounts, ViewLights, view_lights
 from vtfs.lights import Lights
 from vtfs.morton import morton_codes
 from vtfs.op_counts import (
@@ -36,7 +37,7 @@ from vtfs.op_counts import (
     walk_rows,
 )
 from vtfs.parameters import PARAMETERS, Configuration
-from vtfs.techniques import REGISTRY, Plan, Stage, approximates, volume_chunk, walk_chunk
+from vtfs.techniques import REGISTRY, Plan, Stage, Walked, approximates, assign_chunk, volume_chunk
 from vtfs.view_samples import ViewSamples
 
 _BRUTE_FORCE_WORD = 32
@@ -290,14 +291,16 @@ def lengths_of(config: Configuration, env: dict[str, Any], inputs: FrameInputs) 
 class FrameCounts:
     """Exact counts of one frame.
 
-    - `technique`: what the technique does, whatever the `batch`; see `op_counts`.
-    - `of_block`: lengths of the blocks' lists, the `n_solid_blocks` of solid samples first; `walk_rows`,
-      `light_runs`: what `at_batch` needs besides.
+    - `technique`: what the technique as published does, whatever the `batch` and the `assigner` (but for `memory`);
+      see `op_counts`.
+    - `of_block`: lengths of the blocks' lists, the `n_solid_blocks` of solid samples first; `walked`,
+      `walk_rows`, `light_runs`: what `at_batch` needs besides.
     """
 
     technique: OpCounts
     of_block: np.ndarray
     n_solid_blocks: int
+    walked: Walked
     walk_rows: tuple[int, ...]
     light_runs: int
     branching: int
@@ -305,7 +308,7 @@ class FrameCounts:
 
     def at_batch(self, batch: int) -> OpCounts:
         """All counts, with those of this implementation's chunks."""
-        chunk = walk_chunk(batch, self.branching, self.sizes.pairs)
+        chunk = assign_chunk(self.walked, batch, self.branching, self.sizes.pairs)
         capacity = self.sizes.blocks or len(self.of_block)
         own = batch_counts(self.of_block, self.n_solid_blocks, self.walk_rows, batch, capacity, chunk)
         if self.light_runs:
@@ -320,6 +323,7 @@ class FrameCounts:
             "counts": np.array(list(self.technique.values()), np.int64),
             "of_block": self.of_block,
             "scalars": np.array([self.n_solid_blocks, self.light_runs, self.branching, *sizes], np.int64),
+            "walked": np.array(self.walked),
             "walk_rows": np.array(self.walk_rows, np.int64),
         }
 
@@ -328,7 +332,10 @@ class FrameCounts:
         technique = {str(name): int(value) for name, value in zip(arrays["names"], arrays["counts"], strict=True)}
         walk_rows = tuple(int(rows) for rows in arrays["walk_rows"])
         n_solid_blocks, light_runs, branching, *sizes = (int(value) for value in arrays["scalars"])
-        return cls(technique, arrays["of_block"], n_solid_blocks, walk_rows, light_runs, branching, Sizes(*sizes))
+        walked: Walked = str(arrays["walked"])  # type: ignore[assignment]
+        return cls(
+            technique, arrays["of_block"], n_solid_blocks, walked, walk_rows, light_runs, branching, Sizes(*sizes)
+        )
 
 
 def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None) -> tuple[FrameCounts, ListLengths]:
@@ -345,13 +352,12 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     fragments = inputs.fragments(technique.shades_hidden(config))
     counts = shading_counts(lengths, fragments.n_samples, fragments.n_transparent_samples, tile_px)
     counts |= {"hidden_fragments": fragments.n_samples - inputs.fragments(with_hidden=False).n_samples}
-    rows: tuple[int, ...] = ()
-    light_runs = 0
+    walked, rows, light_runs = technique.walked(technique.plan(config), inputs.n_lights), (), 0
     if technique.lists == "clusters":
         listed = list_lengths(env["positions"], env["clusters"], env["listed"])
         counts |= cluster_counts(listed, n_cells(env["grid"], inputs.viewport), inputs.n_lights)
         counts |= approximation_counts(listed, lengths)
-        counts |= assign_counts(env["assign_counts"], inputs.n_lights, branching)
+        counts |= assign_counts(_published_counts(config, env, inputs), inputs.n_lights, branching)
         rows = walk_rows(env["assign_counts"])
         if technique.one_slice:
             counts["lighting_computations_tile_area"] = counts["light_cluster_pairs"] * tile_px[0] * tile_px[1]
@@ -363,8 +369,21 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     structures = list({id(value): value for name, value in env.items() if name not in _NO_STRUCTURES}.values())
     counts |= memory_counts(env["gbuffer"], structures, fragments.n_samples, counts.get("light_cluster_pairs", 0))
     counts |= gbuffer_traffic(technique.reads_gbuffer, counts)
-    frame_counts = FrameCounts(counts, lengths.of_block, lengths.n_solid_blocks, rows, light_runs, branching, sizes)
+    frame_counts = FrameCounts(
+        counts, lengths.of_block, lengths.n_solid_blocks, walked, rows, light_runs, branching, sizes
+    )
     return frame_counts, lengths
+
+
+def _published_counts(config: Configuration, env: dict[str, Any], inputs: FrameInputs) -> AssignCounts:
+    """What the technique's own assigner does, however the lists of `env` were made."""
+    technique = REGISTRY[config.technique]
+    published = replace(technique.plan(config), assigner="published")
+    if technique.walked(published, inputs.n_lights) == "all_pairs":
+        return every_pair(int(env["clusters"].n_clusters), inputs.n_lights)
+    if technique.plan(config) == published:
+        return env["assign_counts"]
+    return run_stages(config.replaced(assigner="published"), inputs, until="assign")[0]["assign_counts"]
 
 
 def is_listed(config: Configuration) -> bool:

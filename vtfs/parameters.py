@@ -37,6 +37,8 @@ class Parameter:
     @property
     def allowed(self) -> str:
         """The values, for a message to the user."""
+        if self.choices == _BATCHES:
+            return f"0, or a power of two from {_BATCHES[1]} to {_BATCHES[-1]}"
         if self.choices:
             return ", ".join(str(choice) for choice in self.choices)
         if isinstance(self.default, str):
@@ -103,9 +105,18 @@ PARAMETERS: dict[str, Parameter] = {
         Parameter(
             "resort_every",
             1,
-            "frames from one sort of the light tree to the next; between them its order is kept and its boxes refitted",
+            "frames from one sort of the light tree to the next; between them its order is kept and its boxes are "
+            "refitted. Above 1 lists are made as published, by that tree",
             low=1,
             high=64,
+        ),
+        Parameter(
+            "assigner",
+            "auto",
+            "how lists are made, which never changes them: as published (all lights against all cells, or a tree of "
+            "lights), from groups of cells to cells, or, as faster on the device, all pairs while lights are few, "
+            "then groups",
+            choices=("auto", "published", "coarse_to_fine"),
         ),
         Parameter(
             "batch",
@@ -168,8 +179,9 @@ _TILES = ("tile_px", "tile_px_x", "tile_px_y", "grid")
 _SLICES = ("depth_slices", "depth_scheme")
 _CLUSTERS = ("bounds", "cull", "unique", "normal_bins", "normal_cones")
 _SHADING = ("gbuffer", "light_cutoff")
-_BRUTE_FORCE = ("batch", *_CLUSTERS, *_SHADING, "approximate")
-_BY_TREE = (*_TILES, *_SLICES, "branching", "resort_every", "batch", *_CLUSTERS, "leaf_test", *_SHADING, "approximate")
+_BRUTE_FORCE = ("assigner", "batch", *_CLUSTERS, *_SHADING, "approximate")
+_TREE = ("branching", "resort_every", "assigner")
+_BY_TREE = (*_TILES, *_SLICES, *_TREE, "batch", *_CLUSTERS, "leaf_test", *_SHADING, "approximate")
 
 ACCURACY = ("gbuffer", "light_cutoff", "approximate")
 """Parameters that change the image: their defaults are exact."""
@@ -178,7 +190,7 @@ TECHNIQUES: dict[str, tuple[str, ...]] = {
     "forward": ("prepass", "batch", *_SHADING),
     "deferred": ("batch", *_SHADING),
     "deferred_stencil": ("batch", *_SHADING),
-    "tiled_forward": (*_TILES, "batch", "cull", *_SHADING),
+    "tiled_forward": (*_TILES, "assigner", "batch", "cull", *_SHADING),
     "tiled_forward_prez": (*_TILES, *_BRUTE_FORCE),
     "tiled_deferred": (*_TILES, *_BRUTE_FORCE),
     "clustered_deferred": _BY_TREE,
@@ -196,6 +208,11 @@ in their passes over the geometry run the same programs: `tiled_forward_prez` th
 _OWN_DEFAULTS: dict[tuple[str, str], Value] = {
     ("tiled_deferred", "bounds"): "depth_range",
     ("tiled_forward_prez", "bounds"): "depth_range",
+    # What tells these from one another is how they make their lists.
+    ("volume_tiled", "assigner"): "published",
+    ("volume_tiled_bvh", "assigner"): "published",
+    ("clustered_deferred", "assigner"): "published",
+    ("clustered_forward", "assigner"): "published",
 }
 
 
@@ -298,4 +315,15 @@ def _settled(technique: str, params: dict[str, Value]) -> dict[str, Value]:
             params["cull"] = "frustum"  # nor is the cell a box
         elif params["bounds"] == "frustum" and not exact:
             params["bounds"] = "implicit"
+    if params.get("assigner") == "coarse_to_fine" and not passes_only_what_meets_the_box(params):
+        name = "leaf_test" if params.get("leaf_test") == "box" else "cull"
+        raise ConflictError(
+            f"parameter `assigner` = 'coarse_to_fine' with {name}={params[name]}: groups are tested by their boxes, "
+            "which that test does not keep to; give cull=box or frustum and leaf_test=sphere, or assigner=published."
+        )
     return params
+
+
+def passes_only_what_meets_the_box(params: Mapping[str, Value]) -> bool:
+    """Is a light listed only where its sphere meets the box of the cell? Lists of groups of cells rely on it."""
+    return params.get("cull", "box") in ("box", "frustum") and params.get("leaf_test", "sphere") == "sphere"

@@ -13,11 +13,13 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
+from vtfs.bit_lists import WORD_BITS
 from vtfs.cluster_grid import ClusterGrid
 from vtfs.cluster_light import split_lists
 from vtfs.clusters import Bounds, Clusters, Unique, everything, form_clusters
 from vtfs.gbuffer import GBuffer, LayerTable, Positions
 from vtfs.light_assignment.brute_force import assign_brute_force
+from vtfs.light_assignment.coarse_to_fine import GROUP, assign_coarse_to_fine
 from vtfs.light_assignment.light_tree import (
     LightTree,
     assign_tree,
@@ -31,12 +33,22 @@ from vtfs.light_lists import AssignCounts, LightLists, ViewLights
 from vtfs.light_volumes import LightPixels, draw_light_volumes, shade_light_volumes
 from vtfs.morton import morton_codes
 from vtfs.normal_cones import Components, ConeKind
-from vtfs.parameters import Configuration
+from vtfs.parameters import Configuration, passes_only_what_meets_the_box
 from vtfs.shading import ClusterLight, Image, blend_layers, chunk_blocks, shade
 
 _TESTS_AT_ONCE = {"cpu": 2**19, "gpu": 2**22}
 """`batch = 0` means all queries at once, as far as their rows of boxes stay in the cache of a CPU (12 MB) or leave
 the memory of a GPU to others (100 MB)."""
+
+_WORDS_AT_ONCE = {"cpu": 2**14, "gpu": 2**22}
+"""The same, in words of 32 tests, where lists are refined: one light is loaded for all cells of a group."""
+
+_FEW_LIGHTS = {"cpu": 256, "gpu": 256}
+"""Up to so many lights `auto` tests all pairs; see `benchmarks/light_assignment.py`."""
+
+Assigner = Literal["published", "coarse_to_fine", "auto"]
+Walked = Literal["all_pairs", "tree", "groups"]
+"""How lists were made: every light against every cell, by a tree of lights, or from groups of cells to cells."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +58,7 @@ class Plan:
     - `two_lists`: transparent samples have lists of their own.
     - `keeps_order`: the light tree is sorted in some frames only.
     - `approximates`: lights that vary little over a cluster are evaluated once for it.
+    - `assigner`: `published` also where `auto` has no choice.
     - `cells`, `blocks`, `pairs`: rounded capacities (see `frame.Sizes`).
     """
 
@@ -59,6 +72,7 @@ class Plan:
     approximates: bool = False
     keeps_order: bool = False
     branching: int = 0
+    assigner: Assigner = "published"
     batch: int = 0
     cells: int = 0
     blocks: int = 0
@@ -106,6 +120,9 @@ class Technique:
     def plan(self, config: Configuration) -> Plan:
         """The static part of a configuration, without capacities."""
         params = config.params
+        keeps_order = int(params.get("resort_every", 1)) > 1
+        has_choice = passes_only_what_meets_the_box(params) and not keeps_order  # only a tree has an order to keep
+        assigner = params.get("assigner", "published") if has_choice else "published"
         return Plan(
             bounds=params.get("bounds", "implicit"),  # type: ignore[arg-type]
             two_lists=self.two_lists,
@@ -116,8 +133,9 @@ class Technique:
             normal_cones="explicit" if approximates(config) else params.get("normal_cones", "implicit"),  # type: ignore[arg-type]
             sections=needs_sections(params.get("cull", "box")),  # type: ignore[arg-type]
             approximates=approximates(config),
-            keeps_order=int(params.get("resort_every", 1)) > 1,
+            keeps_order=keeps_order,
             branching=int(params.get("branching", 0)),
+            assigner=assigner,  # type: ignore[arg-type]
             batch=int(params.get("batch", 0)),
         )
 
@@ -126,12 +144,20 @@ class Technique:
         return config.params.get("prepass", "off" if self.without_prepass else "on") == "off"
 
     def stages_of(self, plan: Plan, has_transparent: bool) -> tuple[Stage, ...]:
-        """The stages of a frame; that of transparent samples only where there are any, and one that sorts lights or not
-        in place of three where their order is kept."""
+        """The stages of a frame; that of transparent samples only where there are any, a tree of lights only where the
+        lists are made as published, and one stage that sorts them or not in place of three where their order is kept.
+        """
+        stages = self.stages if plan.assigner == "published" else _without_tree(self.stages)
         left_out = {"shade_transparent": not has_transparent, "approximate": not plan.approximates}
         left_out |= dict.fromkeys(("reduce", "morton"), plan.keeps_order)
-        stages = (_SORT_OR_KEEP if stage is _SORT and plan.keeps_order else stage for stage in self.stages)
+        stages = (_SORT_OR_KEEP if stage is _SORT and plan.keeps_order else stage for stage in stages)
         return tuple(stage for stage in stages if not left_out.get(stage.name, False))
+
+    def walked(self, plan: Plan, n_lights: int) -> Walked:
+        """How lists are made of so many lights on this device."""
+        if plan.assigner == "published":
+            return "tree" if _BUILD_TREE in self.stages else "all_pairs"
+        return _fastest(n_lights) if plan.assigner == "auto" else "groups"
 
 
 def approximates(config: Configuration) -> bool:
@@ -170,6 +196,26 @@ def walk_chunk(batch: int, branching: int, pairs: int) -> int:
 def _assign_brute_force(plan: Plan, lights: ViewLights, light_cutoff, clusters: Clusters) -> Assigned:
     chunk = walk_chunk(plan.batch, 32, plan.pairs)
     return assign_brute_force(lights.spheres(light_cutoff), clusters, plan.pairs, chunk, plan.cull, lights.cones)
+
+
+def _fastest(n_lights: int) -> Walked:
+    return "all_pairs" if n_lights <= _FEW_LIGHTS.get(jax.default_backend(), 0) else "groups"
+
+
+def _assign_otherwise(plan: Plan, lights: ViewLights, light_cutoff, clusters: Clusters) -> Assigned:
+    """Not as published: no tree of lights."""
+    if plan.assigner == "auto" and _fastest(lights.n_lights) == "all_pairs":
+        return _assign_brute_force(plan, lights, light_cutoff, clusters)
+    spheres, chunk = lights.spheres(light_cutoff), assign_chunk("groups", plan.batch, plan.branching, plan.pairs)
+    branching = plan.branching or GROUP
+    return assign_coarse_to_fine(spheres, clusters, plan.pairs, chunk, branching, plan.cull, lights.cones)
+
+
+def assign_chunk(walked: Walked, batch: int, branching: int, pairs: int) -> int:
+    """Rows tested at once: (cluster, node) pairs, or words of 32 (cluster, light) pairs."""
+    if walked == "groups":
+        return batch or _WORDS_AT_ONCE.get(jax.default_backend(), 2**22)
+    return walk_chunk(batch, branching if walked == "tree" else WORD_BITS, pairs)
 
 
 def _assign_tree(plan: Plan, tree: LightTree, clusters: Clusters) -> Assigned:
@@ -278,6 +324,11 @@ def _all_lights(lights: ViewLights, clusters: Clusters) -> LightLists:
     return LightLists(zeros, zeros + n_lights, jnp.arange(n_lights), jnp.int32(n_lights), jnp.bool_(False))
 
 
+def _without_tree(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    kept = tuple(stage for stage in stages if stage.name not in ("reduce", "morton", "sort", "build_tree"))
+    return tuple(_ASSIGN_OTHERWISE if stage.name == "assign" else stage for stage in kept)
+
+
 _CLUSTERS = Stage(
     "clusters",
     _clusters,
@@ -289,12 +340,19 @@ _ASSIGN_BRUTE_FORCE = Stage(
 )
 _SORT = Stage("sort", _sort, ("morton",))
 _SORT_OR_KEEP = Stage("sort", _sort_or_keep, ("lights", "light_cutoff", "old_order", "frame", "resort_every"))
+_BUILD_TREE = Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",))
 _ASSIGN_BY_TREE = (
     Stage("reduce", _reduce, ("lights", "light_cutoff")),
     Stage("morton", _morton, ("lights", "light_cutoff", "reduce")),
     _SORT,
-    Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",)),
+    _BUILD_TREE,
     Stage("assign", _assign_tree, ("build_tree", "clusters"), ("branching", "batch", "pairs", "cull", "leaf_test")),
+)
+_ASSIGN_OTHERWISE = Stage(
+    "assign",
+    _assign_otherwise,
+    ("lights", "light_cutoff", "clusters"),
+    ("assigner", "branching", "batch", "pairs", "cull"),
 )
 _LIGHTS = ("lights", "light_cutoff")
 _APPROXIMATE = Stage(

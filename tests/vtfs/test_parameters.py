@@ -44,6 +44,7 @@ def test_a_bad_value_is_refused_by_name_with_what_is_allowed(name, value):
         ("tile_px", "a whole number from 2 to 256"),
         ("depth_slices", "a whole number from 0 to 1024"),
         ("branching", "2, 4, 8, 16, 32, 64"),
+        ("batch", "0, or a power of two from 32 to 16777216"),
         ("light_cutoff", "a number from 0 to 0.99"),
         ("bounds", "implicit, explicit, packed, frustum, depth_range"),
         ("tile_px_x", "a whole number from 2 to 256, or 0: tile_px"),
@@ -75,7 +76,7 @@ def test_defaults_are_those_of_the_design():
     defaults = {name: parameter.default for name, parameter in PARAMETERS.items()}
     assert defaults == {
         "tile_px": 32, "tile_px_x": 0, "tile_px_y": 0, "grid": "off", "depth_slices": 0, "depth_scheme": "self_similar",
-        "branching": 32, "batch": 0, "bounds": "implicit", "cull": "box", "leaf_test": "sphere",
+        "branching": 32, "assigner": "auto", "batch": 0, "bounds": "implicit", "cull": "box", "leaf_test": "sphere",
         "unique": "page_table", "normal_bins": 0, "normal_cones": "implicit", "gbuffer": "float32", "light_cutoff": 0.0,
         "prepass": "on", "approximate": 0.0, "resort_every": 1,
     }  # fmt: skip
@@ -84,6 +85,11 @@ def test_defaults_are_those_of_the_design():
     assert {key: value for key, value in own.items() if value != defaults[key[1]]} == {
         ("tiled_deferred", "bounds"): "depth_range",
         ("tiled_forward_prez", "bounds"): "depth_range",
+        # What tells these apart is how they make their lists.
+        **{
+            (name, "assigner"): "published"
+            for name in ("volume_tiled", "volume_tiled_bvh", "clustered_deferred", "clustered_forward")
+        },
     }
 
 

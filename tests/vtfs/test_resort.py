@@ -13,6 +13,7 @@ from vtfs.parameters import configuration
 from vtfs.techniques import REGISTRY
 
 SAMPLES = surface_samples(a_camera(), 11)
+TREE = {"branching": 8, "batch": 1024, "assigner": "published"}
 START = nearby_lights(SAMPLES, 200, 11)
 VELOCITY_M = np.random.default_rng(11).normal(size=(200, 3)) * 0.8
 
@@ -26,7 +27,7 @@ def inputs_of(frame):
 
 
 def config(resort_every):
-    return configuration("volume_tiled_bvh", {"branching": 8, "batch": 1024, "resort_every": resort_every})
+    return configuration("volume_tiled_bvh", {**TREE, "resort_every": resort_every})
 
 
 def tree_tests(frame, resort_every):
@@ -54,7 +55,12 @@ def test_an_old_order_costs_tests_and_a_new_one_none():
 
 def test_one_stage_sorts_or_not_in_place_of_three():
     technique = REGISTRY["clustered_forward"]
-    names = [s.name for s in technique.stages_of(technique.plan(configuration("clustered_forward")), True)]
+    names = [
+        s.name
+        for s in technique.stages_of(
+            technique.plan(configuration("clustered_forward", {"assigner": "published"})), True
+        )
+    ]
     kept = [
         s.name
         for s in technique.stages_of(technique.plan(configuration("clustered_forward", {"resort_every": 2})), True)
