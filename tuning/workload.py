@@ -19,6 +19,7 @@ from tuning.measurement import Measurement, Outcome
 from tuning.shadow_check import MaskCheck, ShadowChecker, masks_on_host
 from tuning.timing import interleaved_ms, repeats_ms, timed_ms
 from vtfs.cache import cached
+from vtfs.cell_maps import CellMaps, cell_maps
 from vtfs.device import device_name, versions
 from vtfs.frame import (
     NO_SIZES,
@@ -38,8 +39,8 @@ from vtfs.frame import (
 )
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
-from vtfs.op_counts import OpCounts
-from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration, is_exact
+from vtfs.op_counts import ListLengths, OpCounts
+from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration
 from vtfs.reference import forward_reference, image_error
 from vtfs.shadow_inputs import ShadowScene
 from vtfs.techniques import REGISTRY
@@ -82,7 +83,10 @@ class SceneWorkload:
         self._path = path
         self._compiles = compiles
         self._objective = objective
-        self._inputs = [FrameInputs(samples, path.lights, path.shadow_scene) for samples in path.samples]
+        self._inputs = [
+            FrameInputs(samples, path.lights, frame, shadow_scene=path.shadow_scene)
+            for samples, frame in zip(path.samples, path.frames, strict=True)
+        ]
         self._reference: np.ndarray | None = None
         self._checker: ShadowChecker | None = None
         self._counted: dict[tuple[Configuration, int], FrameCounts] = {}
@@ -154,9 +158,17 @@ class SceneWorkload:
         """Which pixels of that frame have a sample."""
         return self._inputs[0].seen()
 
-    def list_lengths(self, config: Configuration) -> np.ndarray:
-        """Lights listed for each pixel of that frame."""
-        return count(config, self._inputs[0])[1].of_sample
+    def solid(self) -> np.ndarray:
+        """Which of them have a solid one."""
+        return self._inputs[0].samples.valid
+
+    def list_lengths(self, config: Configuration) -> ListLengths:
+        """Lights listed for each pixel and each cell of that frame."""
+        return count(config, self._inputs[0])[1]
+
+    def cell_maps(self, config: Configuration) -> CellMaps | None:
+        """The cells of that frame; None where the technique has none."""
+        return cell_maps(config, self._inputs[0])
 
     def reference(self) -> np.ndarray:
         """The float64 image of the frame with the most work, without shadows."""
@@ -191,7 +203,7 @@ class SceneWorkload:
             reference = self.reference()
         with np.errstate(invalid="ignore", over="ignore"):  # of an image that overflowed the error is infinite
             taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), reference, valid)
-        if is_exact(config) and not taken.error <= EXACT_ERROR:
+        if config.is_exact and not taken.error <= EXACT_ERROR:
             return "failed", f"error {taken.error:.2g} against the float64 reference; float32 explains {EXACT_ERROR:g}"
         # The first run's time may be the compiler's: only a second one is held against the configuration.
         slow = time.perf_counter() - started > TIMEOUT_S

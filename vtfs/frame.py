@@ -15,13 +15,16 @@ from vtfs.cluster_grid import cluster_grid, configured_grid, n_cells, n_keys, ti
 from vtfs.gbuffer import RUN_WIDTH_PX, Fragments, GBuffer, LayerTable, Positions, from_runs
 from vtfs.input_error import InputError
 from vtfs.light_assignment.brute_force import every_pair
-from vtfs.light_lists import AssignCounts, view_lights
+from vtfs.light_assignment.light_tree import reduce_lights, sort_lights
+from vtfs.light_lists import AssignCounts, ViewLights, view_lights
 from vtfs.light_shadows import CastMask
 from vtfs.lights import Lights
+from vtfs.morton import morton_codes
 from vtfs.op_counts import (
     ListLengths,
     OpCounts,
     added,
+    approximation_counts,
     assign_counts,
     batch_counts,
     cluster_counts,
@@ -45,11 +48,15 @@ from vtfs.shadow_techniques import (
     shadows_counts,
     with_shadow_sizes,
 )
-from vtfs.techniques import REGISTRY, Plan, Stage, Walked, assign_chunk, volume_chunk
+from vtfs.techniques import REGISTRY, Plan, Stage, Walked, approximates, assign_chunk, volume_chunk
 from vtfs.view_samples import ViewSamples
 
 _BRUTE_FORCE_WORD = 32
-_NO_STRUCTURES = ("positions", "gbuffer", "normals", "grid", "light_cutoff")
+_NO_STRUCTURES = (
+    "positions", "gbuffer", "normals", "grid", "light_cutoff", "approximate", "frame", "resort_every",
+)  # fmt: skip
+
+_SCALARS = ("grid", "light_cutoff", "approximate", "frame", "resort_every")
 
 
 class CapacityError(InputError):
@@ -102,12 +109,27 @@ def rounded_up(name: str, needed: int) -> int:
 
 
 class FrameInputs:
-    """One frame on the device: view samples and lights, uploaded once and used by every configuration."""
+    """One frame on the device: view samples and lights, uploaded once and used by every configuration.
 
-    def __init__(self, samples: ViewSamples, lights: Lights, shadow_scene: ShadowScene | None = None):
+    - `frame`: its number on the path: where `resort_every` divides it, the light tree is sorted.
+    - `earlier_lights`: where lights were in an earlier frame, in its view space; where they are now unless given.
+    - `shadow_scene`: what casts shadows, for shadow techniques.
+    """
+
+    def __init__(
+        self,
+        samples: ViewSamples,
+        lights: Lights,
+        frame: int = 0,
+        earlier_lights: Callable[[int], ViewLights] | None = None,
+        shadow_scene: ShadowScene | None = None,
+    ):
         self._shadow_scene = shadow_scene
         self._lights = lights
         self.samples = samples
+        self.frame = frame
+        self._earlier_lights = earlier_lights
+        self._orders: dict[tuple[int, float], jax.Array] = {}
         self.camera = samples.camera
         self.viewport = samples.camera.viewport
         self.lights = view_lights(lights, samples.camera)
@@ -152,6 +174,13 @@ class FrameInputs:
             self._gbuffers[key] = self.fragments(with_hidden).gbuffer(self.positions(with_hidden), precision)
         return self._gbuffers[key]
 
+    def order_of(self, frame: int, light_cutoff: float) -> jax.Array:
+        """The lights in Morton order of an earlier frame: what that frame left for those after it."""
+        if (frame, light_cutoff) not in self._orders:
+            lights = self._earlier_lights(frame) if self._earlier_lights else self.lights
+            self._orders[frame, light_cutoff] = _morton_order(lights, np.float32(light_cutoff))
+        return self._orders[frame, light_cutoff]
+
     def seen(self) -> np.ndarray:
         """Which pixels show anything: bool `[h, w]`."""
         layers = [layer.samples.valid for layer in self.samples.layers.transparent]
@@ -168,16 +197,24 @@ class FrameInputs:
             "layers": self.layers,
             "lights": self.lights,
             "light_cutoff": np.float32(params["light_cutoff"]),
+            "approximate": np.float32(params.get("approximate", 0)),
+            "cluster_light": None,
         }
+        resort_every = int(params.get("resort_every", 1))
+        if resort_every > 1:
+            last_sorted = self.frame - self.frame % resort_every
+            env["old_order"] = self.order_of(last_sorted, float(params["light_cutoff"]))
+            env |= {"frame": np.int32(self.frame), "resort_every": np.int32(resort_every)}
         if technique.lists == "clusters":
             env["grid"] = configured_grid(self.camera, params, self.deepest_m, technique.one_slice)
             # Only where they are read: each precision of the G-buffer would compile the clusters again.
-            needs_normals = params.get("normal_bins", 0) or params.get("normal_cones", "implicit") == "explicit"
+            has_cones = technique.plan(config).normal_cones == "explicit"
+            needs_normals = has_cones or params.get("normal_bins", 0)
             env["normals"] = env["gbuffer"].normal if needs_normals else None
         elif technique.lists == "light_volumes":  # for its pixels
             env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
         # A dozen scalars, each of which would be sent to a GPU by itself in every frame: 0.3 ms.
-        env |= jax.device_put({name: env[name] for name in ("grid", "light_cutoff") if name in env})
+        env |= jax.device_put({name: env[name] for name in _SCALARS if name in env})
         if technique.casts_shadows:
             env["shadow_slots"] = self.shadows.slots
             if config.technique in SHADOW_REFERENCES:
@@ -185,6 +222,12 @@ class FrameInputs:
             else:
                 env["shadow_tasks"] = self.shadows.tasks(config)
         return env
+
+
+@jax.jit
+def _morton_order(lights: ViewLights, light_cutoff) -> jax.Array:
+    spheres = lights.spheres(light_cutoff)
+    return sort_lights(morton_codes(spheres, *reduce_lights(spheres)))
 
 
 def planned(config: Configuration, sizes: Sizes) -> Plan:
@@ -217,9 +260,13 @@ def narrowed(stage: Stage, plan: Plan) -> Plan:
 
 def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
     """Add a stage's result to what later stages may need. An assignment's counts stay apart from its lists: their
-    shape depends on the tree, and would compile the shading again for every branching."""
+    shape depends on the tree, and would compile the shading again for every branching. What is evaluated once a
+    cluster leaves the lists."""
     if stage == "assign":
         env["assign"], env["assign_counts"] = result
+        env["listed"] = env["assign"]
+    elif stage == "approximate":
+        env["assign"], env["cluster_light"] = result
     else:
         env[stage] = result
 
@@ -388,7 +435,8 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
         return _count_shadowed(config, inputs, sizes)
     technique = REGISTRY[config.technique]
     if is_listed(config):
-        env, sizes = run_stages(config, inputs, sizes, until="assign")
+        last = "approximate" if approximates(config) else "assign"
+        env, sizes = run_stages(config, inputs, sizes, until=last)
     else:
         env, sizes = inputs.environment(config), NO_SIZES
     lengths = lengths_of(config, env, inputs)
@@ -399,7 +447,9 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     counts |= {"hidden_fragments": fragments.n_samples - inputs.fragments(with_hidden=False).n_samples}
     walked, rows, light_runs = technique.walked(technique.plan(config), inputs.n_lights), (), 0
     if technique.lists == "clusters":
-        counts |= cluster_counts(lengths, n_cells(env["grid"], inputs.viewport), inputs.n_lights)
+        listed = list_lengths(env["positions"], env["clusters"], env["listed"])
+        counts |= cluster_counts(listed, n_cells(env["grid"], inputs.viewport), inputs.n_lights)
+        counts |= approximation_counts(listed, lengths)
         counts |= assign_counts(_published_counts(config, env, inputs), inputs.n_lights, branching)
         rows = walk_rows(env["assign_counts"])
         if technique.one_slice:
@@ -408,24 +458,14 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
         light_runs = int(env["assign"].total)
         n_tests = inputs.n_lights * inputs.positions(with_hidden=False).n_visible_runs
         counts |= {"lights": inputs.n_lights, "leaf_tests": n_tests, "light_runs": light_runs}
-    structures = [value for name, value in env.items() if name not in _NO_STRUCTURES]
+    # By identity: lists that nothing was taken off are those that were assigned.
+    structures = list({id(value): value for name, value in env.items() if name not in _NO_STRUCTURES}.values())
     counts |= memory_counts(env["gbuffer"], structures, fragments.n_samples, counts.get("light_cluster_pairs", 0))
     counts |= gbuffer_traffic(technique.reads_gbuffer, counts)
     frame_counts = FrameCounts(
         counts, lengths.of_block, lengths.n_solid_blocks, walked, rows, light_runs, branching, sizes
     )
     return frame_counts, lengths
-
-
-def _published_counts(config: Configuration, env: dict[str, Any], inputs: FrameInputs) -> AssignCounts:
-    """What the technique's own assigner does, however the lists of `env` were made."""
-    technique = REGISTRY[config.technique]
-    published = replace(technique.plan(config), assigner="published")
-    if technique.walked(published, inputs.n_lights) == "all_pairs":
-        return every_pair(int(env["clusters"].n_clusters), inputs.n_lights)
-    if technique.plan(config) == published:
-        return env["assign_counts"]
-    return run_stages(config.replaced(assigner="published"), inputs, until="assign")[0]["assign_counts"]
 
 
 def _count_shadowed(config: Configuration, inputs: FrameInputs, sizes: Sizes | None) -> tuple[FrameCounts, ListLengths]:
@@ -448,6 +488,17 @@ def cast_counted(config: Configuration, inputs: FrameInputs) -> tuple[list[CastS
     frames = [receiving(task) for task in inputs.shadows.tasks(config)]
     plan, masks = fitted_to_all(config.technique, shadow_plan(config), frames)
     return [on_host(mask, plan, frame) for mask, frame in zip(masks, frames, strict=True)], shadow_sizes(plan)
+
+
+def _published_counts(config: Configuration, env: dict[str, Any], inputs: FrameInputs) -> AssignCounts:
+    """What the technique's own assigner does, however the lists of `env` were made."""
+    technique = REGISTRY[config.technique]
+    published = replace(technique.plan(config), assigner="published")
+    if technique.walked(published, inputs.n_lights) == "all_pairs":
+        return every_pair(int(env["clusters"].n_clusters), inputs.n_lights)
+    if technique.plan(config) == published:
+        return env["assign_counts"]
+    return run_stages(config.replaced(assigner="published"), inputs, until="assign")[0]["assign_counts"]
 
 
 def is_listed(config: Configuration) -> bool:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from vtfs.bit_lists import WORD_BITS
 from vtfs.cluster_grid import ClusterGrid
+from vtfs.cluster_light import split_lists
 from vtfs.clusters import Bounds, Clusters, Unique, everything, form_clusters
 from vtfs.gbuffer import GBuffer, LayerTable, Positions
 from vtfs.light_assignment.brute_force import assign_brute_force
@@ -23,6 +24,7 @@ from vtfs.light_assignment.light_tree import (
     LightTree,
     assign_tree,
     build_light_tree,
+    order_lights,
     reduce_lights,
     sort_lights,
 )
@@ -39,7 +41,7 @@ from vtfs.parameters import (
     lists_configuration,
     passes_only_what_meets_the_box,
 )
-from vtfs.shading import Image, blend_layers, chunk_blocks, shade
+from vtfs.shading import ClusterLight, Image, blend_layers, chunk_blocks, shade
 from vtfs.shadow_inputs import ShadowTask, with_receivers
 from vtfs.shadow_mask import ShadowPlan
 from vtfs.shadow_techniques import SHADOW_TECHNIQUES, shadow_plan
@@ -64,6 +66,8 @@ class Plan:
     """What is static in a frame's programs: it fixes array shapes. A stage sees only what it names.
 
     - `two_lists`: transparent samples have lists of their own.
+    - `keeps_order`: the light tree is sorted in some frames only.
+    - `approximates`: lights that vary little over a cluster are evaluated once for it.
     - `assigner`: `published` also where `auto` has no choice.
     - `cells`, `blocks`, `pairs`: rounded capacities (see `frame.Sizes`).
     - `shadow`: of shadow techniques, with capacities of its own.
@@ -76,6 +80,8 @@ class Plan:
     unique: Unique = "page_table"
     normal_cones: ConeKind = "implicit"
     sections: bool = False
+    approximates: bool = False
+    keeps_order: bool = False
     branching: int = 0
     assigner: Assigner = "published"
     batch: int = 0
@@ -89,8 +95,10 @@ class Plan:
 class Stage:
     """One step of a frame, timed apart.
 
-    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`, of shadow
-      techniques `shadow_tasks` and `shadow_slots`) and earlier stages.
+    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`, `approximate`, for
+      kept orders `old_order`, `frame`, `resort_every`, of shadow techniques `shadow_tasks` and `shadow_slots`) and
+      earlier stages. `listed` are the lists as assigned, `assign` those without what is evaluated once a cluster, and
+      `cluster_light` is that, or None.
     - `statics`: the fields of `Plan` that its program depends on.
     - `per_shadow`: it runs once for each light that casts and each view, in float64: what it needs and its results are
       lists.
@@ -135,15 +143,20 @@ class Technique:
             lists = lists_configuration(config)
             return replace(REGISTRY[lists.technique].plan(lists), shadow=shadow_plan(config))
         params = config.params
-        assigner = params.get("assigner", "published") if passes_only_what_meets_the_box(params) else "published"
+        keeps_order = int(params.get("resort_every", 1)) > 1
+        has_choice = passes_only_what_meets_the_box(params) and not keeps_order  # only a tree has an order to keep
+        assigner = params.get("assigner", "published") if has_choice else "published"
         return Plan(
             bounds=params.get("bounds", "implicit"),  # type: ignore[arg-type]
             two_lists=self.two_lists,
             cull=params.get("cull", "box"),  # type: ignore[arg-type]
             leaf_test=params.get("leaf_test", "sphere"),  # type: ignore[arg-type]
             unique=params.get("unique", "page_table"),  # type: ignore[arg-type]
-            normal_cones=params.get("normal_cones", "implicit"),  # type: ignore[arg-type]
+            # How much light varies depends on where samples face, so that is found out.
+            normal_cones="explicit" if approximates(config) else params.get("normal_cones", "implicit"),  # type: ignore[arg-type]
             sections=needs_sections(params.get("cull", "box")),  # type: ignore[arg-type]
+            approximates=approximates(config),
+            keeps_order=keeps_order,
             branching=int(params.get("branching", 0)),
             assigner=assigner,  # type: ignore[arg-type]
             batch=int(params.get("batch", 0)),
@@ -154,16 +167,25 @@ class Technique:
         return config.params.get("prepass", "off" if self.without_prepass else "on") == "off"
 
     def stages_of(self, plan: Plan, has_transparent: bool) -> tuple[Stage, ...]:
-        """The stages of a frame; that of transparent samples only where there are any, and a tree of lights only where
-        the lists are made as published."""
+        """The stages of a frame; that of transparent samples only where there are any, a tree of lights only where the
+        lists are made as published, and one stage that sorts them or not in place of three where their order is kept.
+        """
         stages = self.stages if plan.assigner == "published" else _without_tree(self.stages)
-        return tuple(stage for stage in stages if has_transparent or stage.name != "shade_transparent")
+        left_out = {"shade_transparent": not has_transparent, "approximate": not plan.approximates}
+        left_out |= dict.fromkeys(("reduce", "morton"), plan.keeps_order)
+        stages = (_SORT_OR_KEEP if stage is _SORT and plan.keeps_order else stage for stage in stages)
+        return tuple(stage for stage in stages if not left_out.get(stage.name, False))
 
     def walked(self, plan: Plan, n_lights: int) -> Walked:
         """How lists are made of so many lights on this device."""
         if plan.assigner == "published":
             return "tree" if _BUILD_TREE in self.stages else "all_pairs"
         return _fastest(n_lights) if plan.assigner == "auto" else "groups"
+
+
+def approximates(config: Configuration) -> bool:
+    """Are some lights evaluated once a cluster?"""
+    return float(config.params.get("approximate", 0)) > 0
 
 
 Assigned = tuple[LightLists, AssignCounts]
@@ -236,6 +258,10 @@ def _sort(plan: Plan, codes):
     return sort_lights(codes)
 
 
+def _sort_or_keep(plan: Plan, lights: ViewLights, light_cutoff, old_order, frame, resort_every):
+    return order_lights(lights.spheres(light_cutoff), old_order, frame, resort_every)
+
+
 def _build_tree(plan: Plan, lights: ViewLights, light_cutoff, order) -> LightTree:
     return build_light_tree(lights.spheres(light_cutoff), order, plan.branching, lights.cones)
 
@@ -259,10 +285,32 @@ def volume_chunk(pairs: int, batch: int) -> int:
     return min(chunk_blocks(pairs, batch), _MAX_VOLUME_RUNS)
 
 
+_PAIRS_AT_ONCE = {"cpu": 2**15, "gpu": 2**20}
+
+
+def _approximate(
+    plan: Plan,
+    gbuffer: GBuffer,
+    lights: ViewLights,
+    light_cutoff,
+    approximate,
+    clusters: Clusters,
+    lists: LightLists,
+) -> tuple[LightLists, ClusterLight]:
+    chunk = min(plan.pairs, _PAIRS_AT_ONCE.get(jax.default_backend(), 2**20))
+    return split_lists(gbuffer, clusters, lists, lights.row, light_cutoff, approximate, chunk)
+
+
 def _shade(
-    plan: Plan, gbuffer: GBuffer, lights: ViewLights, light_cutoff, clusters: Clusters, lists: LightLists
+    plan: Plan,
+    gbuffer: GBuffer,
+    lights: ViewLights,
+    light_cutoff,
+    clusters: Clusters,
+    lists: LightLists,
+    cluster_light: ClusterLight | None = None,
 ) -> Image:
-    return shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch)
+    return shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, cluster_light=cluster_light)
 
 
 def _shade_transparent(
@@ -274,8 +322,9 @@ def _shade_transparent(
     solid: Image,
     clusters: Clusters,
     lists: LightLists,
+    cluster_light: ClusterLight | None = None,
 ) -> Image:
-    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, transparent=True)
+    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, cluster_light=cluster_light)
     return blend_layers(solid, colour, layers)
 
 
@@ -312,7 +361,7 @@ def _shade_transparent_shadowed(
     lists: LightLists,
     shadows: LightShadows,
 ) -> Image:
-    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, shadows)
+    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, shadows=shadows)
     return blend_layers(solid, colour, layers)
 
 
@@ -349,11 +398,13 @@ _CLUSTERS = Stage(
 _ASSIGN_BRUTE_FORCE = Stage(
     "assign", _assign_brute_force, ("lights", "light_cutoff", "clusters"), ("batch", "pairs", "cull")
 )
+_SORT = Stage("sort", _sort, ("morton",))
+_SORT_OR_KEEP = Stage("sort", _sort_or_keep, ("lights", "light_cutoff", "old_order", "frame", "resort_every"))
 _BUILD_TREE = Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",))
 _ASSIGN_BY_TREE = (
     Stage("reduce", _reduce, ("lights", "light_cutoff")),
     Stage("morton", _morton, ("lights", "light_cutoff", "reduce")),
-    Stage("sort", _sort, ("morton",)),
+    _SORT,
     _BUILD_TREE,
     Stage("assign", _assign_tree, ("build_tree", "clusters"), ("branching", "batch", "pairs", "cull", "leaf_test")),
 )
@@ -364,12 +415,15 @@ _ASSIGN_OTHERWISE = Stage(
     ("assigner", "branching", "batch", "pairs", "cull"),
 )
 _LIGHTS = ("lights", "light_cutoff")
+_APPROXIMATE = Stage(
+    "approximate", _approximate, ("gbuffer", *_LIGHTS, "approximate", "clusters", "listed"), ("pairs",)
+)
 _SHADE = (
-    Stage("shade_opaque", _shade, ("gbuffer", *_LIGHTS, "clusters", "assign"), ("batch",)),
+    Stage("shade_opaque", _shade, ("gbuffer", *_LIGHTS, "clusters", "assign", "cluster_light"), ("batch",)),
     Stage(
         "shade_transparent",
         _shade_transparent,
-        ("gbuffer", "layers", *_LIGHTS, "shade_opaque", "clusters", "assign"),
+        ("gbuffer", "layers", *_LIGHTS, "shade_opaque", "clusters", "assign", "cluster_light"),
         ("batch",),
     ),
 )
@@ -409,8 +463,8 @@ def _shadowed(name: str) -> Technique:
     return Technique(name, stages, reads_gbuffer="per_sample")
 
 
-_TILED = (_CLUSTERS, _ASSIGN_BRUTE_FORCE, *_SHADE)
-_CLUSTERED = (_CLUSTERS, *_ASSIGN_BY_TREE, *_SHADE)
+_TILED = (_CLUSTERS, _ASSIGN_BRUTE_FORCE, _APPROXIMATE, *_SHADE)
+_CLUSTERED = (_CLUSTERS, *_ASSIGN_BY_TREE, _APPROXIMATE, *_SHADE)
 
 REGISTRY: dict[str, Technique] = {
     technique.name: technique
