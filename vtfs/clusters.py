@@ -212,7 +212,7 @@ def _by_page_table(block_key: Int[Array, " capacity"], in_use: Bool[Array, " cap
     # Unused places write past the end, which `drop` leaves out.
     # Bytes are a quarter of the memory to clear, but a GPU writes one by replacing the word around it.
     flag = jnp.bool_ if jax.default_backend() == "cpu" else jnp.int32
-    flags = jnp.zeros(cells_capacity, flag).at[jnp.where(in_use, block_key, cells_capacity)].set(1, mode="drop")
+    flags = jnp.zeros(cells_capacity, flag).at[jnp.where(in_use, block_key, cells_capacity)].set(True, mode="drop")
     words = pack_bits(flags.reshape(-1, RUN) != 0)
     cell_start, n_clusters = starts_of(n_bits_set(words[:, 0]))
     row, bit = set_bits(words, cell_start, place)
