@@ -7,9 +7,9 @@ import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from vtfs.frame import FrameCounts, count
+from vtfs.frame import FrameCounts, KeptStages, count
 from vtfs.op_counts import OpCounts
-from vtfs.parameters import Configuration, counted_configuration
+from vtfs.parameters import GRID_PARAMETERS, Configuration, counted_configuration
 from vtfs.scene_setup import SceneSetup
 
 
@@ -31,13 +31,19 @@ def count_frames(
     for frame in frames:
         inputs = setup.inputs(frame)
         counted: dict[Configuration, FrameCounts] = {}
-        for config in configs:
-            canonical = counted_configuration(config)
-            if canonical not in counted:
-                counted[canonical] = count(canonical, inputs)[0]
-            rows.append(CountRow(config, frame, counted[canonical].of(config)))
-            progress(len(rows), len(frames) * len(configs))
+        kept = KeptStages()
+        # Those with the same grid one after the other: they share its clusters.
+        for done, config in enumerate(sorted(map(counted_configuration, configs), key=_grid), 1):
+            if config not in counted:
+                counted[config] = count(config, inputs, kept=kept)[0]
+            progress(len(rows) + done, len(frames) * len(configs))
+        rows += [CountRow(config, frame, counted[counted_configuration(config)].of(config)) for config in configs]
     return rows
+
+
+def _grid(config: Configuration) -> str:
+    """Equal where clusters are."""
+    return str([(name, value) for name, value in config.items if name in GRID_PARAMETERS])
 
 
 def counts_csv(rows: Sequence[CountRow]) -> str:
