@@ -32,8 +32,8 @@ def count_frames(
         inputs = setup.inputs(frame)
         counted: dict[Configuration, FrameCounts] = {}
         kept = KeptStages()
-        # Those with the same grid one after the other: they share its clusters.
-        for done, config in enumerate(sorted(map(counted_configuration, configs), key=_grid), 1):
+        # Those that share clusters one after the other, and of those the ones that share a tree.
+        for done, config in enumerate(sorted(map(counted_configuration, configs), key=_shared), 1):
             if config not in counted:
                 counted[config] = count(config, inputs, kept=kept)[0]
             progress(len(rows) + done, len(frames) * len(configs))
@@ -41,9 +41,10 @@ def count_frames(
     return rows
 
 
-def _grid(config: Configuration) -> str:
-    """Equal where clusters are."""
-    return str([(name, value) for name, value in config.items if name in GRID_PARAMETERS])
+def _shared(config: Configuration) -> tuple[str, str]:
+    """Equal in the first where clusters are, and in both where lists are."""
+    grid = [(name, value) for name, value in config.items if name in GRID_PARAMETERS]
+    return str(grid), str(config.params.get("branching", ""))
 
 
 def counts_csv(rows: Sequence[CountRow]) -> str:
