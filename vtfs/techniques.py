@@ -53,7 +53,7 @@ the memory of a GPU to others (100 MB)."""
 _WORDS_AT_ONCE = {"cpu": 2**14, "gpu": 2**23}
 """The same, in words of 32 tests, where lists are refined: one light is loaded for all cells of a group."""
 
-_FEW_LIGHTS = {"cpu": 256, "gpu": 256}
+_FEW_LIGHTS = {"cpu": 512, "gpu": 256}
 """Up to so many lights `auto` tests all pairs; see `benchmarks/light_assignment.py`."""
 
 Assigner = Literal["published", "coarse_to_fine", "auto"]
