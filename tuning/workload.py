@@ -38,7 +38,7 @@ from vtfs.frame import (
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
 from vtfs.op_counts import ListLengths, OpCounts
-from vtfs.parameters import Configuration, configuration
+from vtfs.parameters import Configuration, configuration, counted_configuration
 from vtfs.reference import forward_reference, image_error
 from vtfs.techniques import REGISTRY
 from vtfs.view_samples import ViewSamples
@@ -80,7 +80,8 @@ class SceneWorkload:
         self._compiles = compiles
         self._objective = objective
         self._inputs = [
-            FrameInputs(samples, path.lights, frame) for samples, frame in zip(path.samples, path.frames, strict=True)
+            FrameInputs(samples, path.lights, frame=frame)
+            for samples, frame in zip(path.samples, path.frames, strict=True)
         ]
         self._reference: np.ndarray | None = None
         self._counted: dict[tuple[Configuration, int], FrameCounts] = {}
@@ -97,13 +98,12 @@ class SceneWorkload:
             return ()
 
     def counts_of_frame(self, config: Configuration, i: int) -> OpCounts:
-        # Counting is done once for all batches: they change no list.
-        canonical = config.replaced(batch=0)
+        canonical = counted_configuration(config)
         if (canonical, i) not in self._counted:
             self._counted[canonical, i] = cached_counts(
                 canonical, self.scene_key, self.frames[i], lambda: self._inputs[i]
             )
-        return self._counted[canonical, i].at_batch(int(config["batch"]))
+        return self._counted[canonical, i].of(config)
 
     def measure(self, config: Configuration, best_ms: float | None, /) -> Measurement:
         """Check a configuration against the float64 reference, then time its frame and its stages."""
@@ -249,7 +249,7 @@ class SceneWorkload:
             return NO_SIZES
         for i in range(len(self._inputs)):
             self.counts_of_frame(config, i)
-        canonical = config.replaced(batch=0)
+        canonical = counted_configuration(config)
         sizes = NO_SIZES
         for i in range(len(self._inputs)):
             sizes = sizes.covering(self._counted[canonical, i].sizes)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from vtfs.frame import FrameCounts, FrameInputs, count
 from vtfs.op_counts import OpCounts
-from vtfs.parameters import Configuration
+from vtfs.parameters import Configuration, counted_configuration
 from vtfs.scene_setup import SceneSetup
 
 
@@ -29,14 +29,13 @@ def count_frames(
     """Exact counts of every configuration on every frame, frame by frame (samples are traced once)."""
     rows: list[CountRow] = []
     for frame in frames:
-        inputs = FrameInputs(setup.samples(frame), setup.lights, frame)
+        inputs = FrameInputs(setup.samples(frame), setup.lights, frame=frame)
         counted: dict[Configuration, FrameCounts] = {}
         for config in configs:
-            # A batch changes how the work is cut up, not the lists.
-            canonical = config.replaced(batch=0)
+            canonical = counted_configuration(config)
             if canonical not in counted:
                 counted[canonical] = count(canonical, inputs)[0]
-            rows.append(CountRow(config, frame, counted[canonical].at_batch(int(config["batch"]))))
+            rows.append(CountRow(config, frame, counted[canonical].of(config)))
             progress(len(rows), len(frames) * len(configs))
     return rows
 

@@ -36,7 +36,16 @@ from vtfs.op_counts import (
     uniform_lengths,
     walk_rows,
 )
-from vtfs.parameters import PARAMETERS, Configuration
+from vtfs.parameters import PARAMETERS, SHADOW_REFERENCES, Configuration, lists_configuration, shading_batch
+from vtfs.shadow_inputs import FrameShadows, ShadowScene, ShadowTask, receiving
+from vtfs.shadow_techniques import (
+    CastShadows,
+    fitted_to_all,
+    on_host,
+    shadow_plan,
+    shadow_sizes,
+    with_shadow_sizes,
+)
 from vtfs.techniques import REGISTRY, Plan, Stage, Walked, approximates, assign_chunk, volume_chunk
 from vtfs.view_samples import ViewSamples
 
@@ -58,14 +67,22 @@ class Sizes:
 
     - `cells`: of the grid's page table; `blocks`: of clusters and of their blocks; `pairs`: of the
       (cluster, light) pairs and of every level on the way to them.
+    - `shadow`: of shadow techniques, see `shadow_sizes`.
     """
 
     cells: int
     blocks: int
     pairs: int
+    shadow: tuple[int, ...] = ()
 
     def covering(self, other: Sizes) -> Sizes:
-        return Sizes(max(self.cells, other.cells), max(self.blocks, other.blocks), max(self.pairs, other.pairs))
+        """What holds both; of the same technique and plan."""
+        shadow = (
+            tuple(max(a, b) for a, b in zip(self.shadow, other.shadow, strict=True))
+            if self.shadow and other.shadow
+            else self.shadow or other.shadow
+        )
+        return Sizes(max(self.cells, other.cells), max(self.blocks, other.blocks), max(self.pairs, other.pairs), shadow)
 
 
 NO_SIZES = Sizes(0, 0, 0)
@@ -92,6 +109,7 @@ def rounded_up(name: str, needed: int) -> int:
 class FrameInputs:
     """One frame on the device: view samples and lights, uploaded once and used by every configuration.
 
+    - `shadow_scene`: what casts shadows; for shadow techniques.
     - `frame`: its number on the path: where `resort_every` divides it, the light tree is sorted.
     - `earlier_lights`: where lights were in an earlier frame, in its view space; where they are now unless given.
     """
@@ -100,9 +118,12 @@ class FrameInputs:
         self,
         samples: ViewSamples,
         lights: Lights,
+        shadow_scene: ShadowScene | None = None,
         frame: int = 0,
         earlier_lights: Callable[[int], ViewLights] | None = None,
     ):
+        self._shadow_scene = shadow_scene
+        self._lights = lights
         self.samples = samples
         self.frame = frame
         self._earlier_lights = earlier_lights
@@ -116,6 +137,16 @@ class FrameInputs:
         self._fragments: dict[bool, Fragments] = {}
         self._positions: dict[bool, Positions] = {}
         self._gbuffers: dict[tuple[bool, str], GBuffer] = {}
+
+    @cached_property
+    def shadows(self) -> FrameShadows:
+        """What casts on this frame.
+
+        **Raises:** `InputError` where there is no geometry, or no light that casts.
+        """
+        if self._shadow_scene is None:
+            raise InputError("shadow techniques need the triangles of a scene: give a scene file, not a G-buffer.")
+        return FrameShadows(self._shadow_scene, self.samples, self._lights)
 
     @cached_property
     def layers(self) -> LayerTable:
@@ -155,7 +186,7 @@ class FrameInputs:
 
     def environment(self, config: Configuration) -> dict[str, Any]:
         """What the stages of a configuration start from, by the names that `Stage.needs` uses."""
-        params = config.params
+        params = lists_configuration(config).params
         technique = REGISTRY[config.technique]
         with_hidden = technique.shades_hidden(config)
         env: dict[str, Any] = {
@@ -180,6 +211,12 @@ class FrameInputs:
             env["normals"] = env["gbuffer"].normal if needs_normals else None
         elif technique.lists == "light_volumes":  # for its pixels
             env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
+        if technique.casts_shadows:
+            env["shadow_slots"] = self.shadows.slots
+            if config.technique in SHADOW_REFERENCES:
+                env["shadow_traverse"] = self.shadows.reference_masks(config)
+            else:
+                env["shadow_tasks"] = self.shadows.tasks(config)
         return env
 
 
@@ -191,13 +228,25 @@ def _morton_order(lights: ViewLights, light_cutoff) -> jax.Array:
 
 def planned(config: Configuration, sizes: Sizes) -> Plan:
     plan = REGISTRY[config.technique].plan(config)
-    return replace(plan, cells=sizes.cells, blocks=sizes.blocks, pairs=sizes.pairs)
+    shadow = with_shadow_sizes(plan.shadow, sizes.shadow) if plan.shadow else None
+    return replace(plan, cells=sizes.cells, blocks=sizes.blocks, pairs=sizes.pairs, shadow=shadow)
 
 
 @functools.cache
 def stage_program(stage: Stage, plan: Plan) -> Callable[..., Any]:
     """One stage as a program of its own. `plan` holds only what the stage names: see `narrowed`."""
-    return jax.jit(functools.partial(stage.run, plan))
+    program = jax.jit(functools.partial(stage.run, plan))
+    return _for_each_shadow(program) if stage.per_shadow else program
+
+
+def _for_each_shadow(program: Callable[..., Any]) -> Callable[..., list[Any]]:
+    """Run for each light that casts and each view, in float64."""
+
+    def run(*lists: list[Any]) -> list[Any]:
+        with jax.enable_x64(True):
+            return [program(*each) for each in zip(*lists, strict=True)]
+
+    return run
 
 
 def narrowed(stage: Stage, plan: Plan) -> Plan:
@@ -219,8 +268,35 @@ def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
 
 
 def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable[..., Any]:
-    """All stages fused in one program: from the inputs to the image and whether anything overflowed."""
-    return _fused(REGISTRY[technique].stages_of(plan, has_transparent), plan)
+    """All stages fused: from the inputs to the image and whether anything overflowed.
+
+    One program; of shadow techniques two, as shadows are found in float64 and shaded in float32: from view samples to
+    the mask of a light, run for each, and from the masks to the image.
+    """
+    stages = REGISTRY[technique].stages_of(plan, has_transparent)
+    casting = tuple(stage for stage in stages if stage.per_shadow)
+    shading = tuple(stage for stage in stages if not stage.per_shadow)
+    image = _fused(shading, replace(plan, shadow=None))
+    if not casting:
+        return image
+    cast = _for_each_shadow(_fused_casting(casting, Plan(shadow=plan.shadow)))
+
+    def run(env: dict[str, Any]):
+        shading_env = {name: value for name, value in env.items() if name != "shadow_tasks"}
+        return image(shading_env | {casting[-1].name: cast(env["shadow_tasks"])})
+
+    return run
+
+
+@functools.cache
+def _fused_casting(stages: tuple[Stage, ...], plan: Plan) -> Callable[..., Any]:
+    def run(task: ShadowTask):
+        env: dict[str, Any] = {"shadow_tasks": task}
+        for stage in stages:
+            env[stage.name] = stage.run(plan, *(env[name] for name in stage.needs))
+        return env[stages[-1].name]
+
+    return jax.jit(run)
 
 
 @functools.cache
@@ -230,8 +306,7 @@ def _fused(stages: tuple[Stage, ...], plan: Plan) -> Callable[..., Any]:
         env = dict(env)
         for stage in stages:
             keep_result(env, stage.name, stage.run(plan, *(env[name] for name in stage.needs)))
-        overflowed = [env["clusters"].overflowed] if "clusters" in env else []
-        overflowed += [env["assign"].overflowed] if "assign" in env else []
+        overflowed = [env[name].overflowed for name in ("clusters", "assign", "shadow_merge") if name in env]
         return env[stages[-1].name], jax.numpy.stack(overflowed).any() if overflowed else np.bool_(False)
 
     return jax.jit(run)
@@ -259,6 +334,8 @@ def run_stages(
         grid_keys *= 2
     fitting = Sizes(rounded_up("cells", grid_keys), rounded_up("blocks", n_runs), rounded_up("pairs", 0))
     sizes = fitting.covering(sizes) if sizes else fitting
+    if "shadow_tasks" in env and not sizes.shadow:
+        sizes = replace(sizes, shadow=cast_counted(config, inputs)[1])
     for stage in technique.stages_of(technique.plan(config), inputs.has_transparent):
         while True:
             plan = narrowed(stage, planned(config, sizes))
@@ -315,9 +392,13 @@ class FrameCounts:
             own = added(own, light_volume_batch_counts(self.light_runs, volume_chunk(self.sizes.pairs, batch)))
         return self.technique | own
 
+    def of(self, config: Configuration) -> OpCounts:
+        """All counts of one of the configurations that have these."""
+        return self.at_batch(shading_batch(config))
+
     def as_arrays(self) -> dict[str, np.ndarray]:
         """For a cache; the inverse of `from_arrays`."""
-        sizes = (self.sizes.cells, self.sizes.blocks, self.sizes.pairs)
+        sizes = (self.sizes.cells, self.sizes.blocks, self.sizes.pairs, *self.sizes.shadow)
         return {
             "names": np.array(list(self.technique)),
             "counts": np.array(list(self.technique.values()), np.int64),
@@ -331,15 +412,16 @@ class FrameCounts:
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> FrameCounts:
         technique = {str(name): int(value) for name, value in zip(arrays["names"], arrays["counts"], strict=True)}
         walk_rows = tuple(int(rows) for rows in arrays["walk_rows"])
-        n_solid_blocks, light_runs, branching, *sizes = (int(value) for value in arrays["scalars"])
+        n_solid_blocks, light_runs, branching, cells, blocks, pairs, *shadow = (int(v) for v in arrays["scalars"])
         walked: Walked = str(arrays["walked"])  # type: ignore[assignment]
-        return cls(
-            technique, arrays["of_block"], n_solid_blocks, walked, walk_rows, light_runs, branching, Sizes(*sizes)
-        )
+        sizes = Sizes(cells, blocks, pairs, tuple(shadow))
+        return cls(technique, arrays["of_block"], n_solid_blocks, walked, walk_rows, light_runs, branching, sizes)
 
 
 def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None) -> tuple[FrameCounts, ListLengths]:
     """Count what a configuration does on a frame; nothing is shaded."""
+    if REGISTRY[config.technique].casts_shadows:
+        return _count_shadowed(config, inputs, sizes)
     technique = REGISTRY[config.technique]
     if is_listed(config):
         last = "approximate" if approximates(config) else "assign"
@@ -384,6 +466,28 @@ def _published_counts(config: Configuration, env: dict[str, Any], inputs: FrameI
     if technique.plan(config) == published:
         return env["assign_counts"]
     return run_stages(config.replaced(assigner="published"), inputs, until="assign")[0]["assign_counts"]
+
+
+def _count_shadowed(config: Configuration, inputs: FrameInputs, sizes: Sizes | None) -> tuple[FrameCounts, ListLengths]:
+    """What shading does as for its lists, with what finding the shadows takes."""
+    shading, lengths = count(lists_configuration(config), inputs, sizes)
+    counts = dict(shading.technique)
+    suns = inputs.shadows.scene.suns.n_lights
+    counts["lighting_computations"] += suns * counts["samples"]
+    counts["shadow_lights"] = len(inputs.shadows.lights)
+    shadow: tuple[int, ...] = ()
+    if config.technique not in SHADOW_REFERENCES:
+        cast, shadow = cast_counted(config, inputs)
+        counts |= {name: sum(each.counts[name] for each in cast) for name in cast[0].counts}
+        counts["memory"] += shading.technique["memory"]
+    return replace(shading, technique=counts, sizes=replace(shading.sizes, shadow=shadow)), lengths
+
+
+def cast_counted(config: Configuration, inputs: FrameInputs) -> tuple[list[CastShadows], tuple[int, ...]]:
+    """Shadows of all lights on each view, with tests and counts, and the capacities that hold them."""
+    frames = [receiving(task) for task in inputs.shadows.tasks(config)]
+    plan, masks = fitted_to_all(config.technique, shadow_plan(config), frames)
+    return [on_host(mask, plan, frame) for mask, frame in zip(masks, frames, strict=True)], shadow_sizes(plan)
 
 
 def is_listed(config: Configuration) -> bool:

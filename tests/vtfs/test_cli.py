@@ -298,7 +298,7 @@ OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
     ("name", "content", "words"),
     [
         ("none.glb", None, ("none.glb", "no such file")),
-        ("nosuch", None, ("nosuch", "atrium, street, grove")),
+        ("nosuch", None, ("nosuch", "atrium, street, grove, conservatory")),
         ("a.blend", "", ("a.blend", "`.blend`", ".glb")),
         ("cut.glb", cut_glb, ("cut.glb", "truncated")),
         ("nan.obj", OBJ.replace("v 0 1 0", "v 0 nan 0"), ("nan.obj", "NaN")),

@@ -70,8 +70,11 @@ def oracle_texel(image, u, v):
 
 @pytest.mark.parametrize(
     ("name", "lens"),
-    [("atrium", Lens()), ("street", Lens()), ("grove", Lens()), ("grove", Lens(orthographic_height_m=9.0))],
-    ids=["atrium", "street", "grove", "parallel"],
+    [
+        *((name, Lens()) for name in ("atrium", "street", "grove", "conservatory")),
+        ("grove", Lens(orthographic_height_m=9.0)),
+    ],
+    ids=["atrium", "street", "grove", "conservatory", "parallel"],
 )
 def test_samples_are_where_rays_meet_all_triangles_in_float64(name, lens):
     scene = build_scene(name, 1_500)

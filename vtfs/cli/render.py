@@ -51,7 +51,7 @@ def render(
     for number in dict.fromkeys(frame or [0]):
         with Status() as status:
             status.say(f"frame {number}")
-            inputs = FrameInputs(setup.samples(number), setup.lights, number)
+            inputs = FrameInputs(setup.samples(number), setup.lights, frame=number)
             image = render_frame(config, inputs)
             _, lengths = count_frame(config, inputs)
             maps = cell_maps(config, inputs)
