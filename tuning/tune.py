@@ -153,7 +153,7 @@ def choose_frames(setup: SceneSetup) -> tuple[int, ...]:
 
 
 def _inputs(setup: SceneSetup, frame: int) -> FrameInputs:
-    return FrameInputs(setup.samples(frame), setup.lights, frame=frame)
+    return setup.inputs(frame)
 
 
 def _config(measurement: Measurement) -> Configuration:

@@ -16,6 +16,7 @@ import numpy as np
 from tuning.choose import Objective, median_interval
 from tuning.compiles import Compiles
 from tuning.measurement import Measurement, Outcome
+from tuning.shadow_check import MaskCheck, ShadowChecker, masks_on_host
 from tuning.timing import interleaved_ms, repeats_ms, timed_ms
 from vtfs.cache import cached
 from vtfs.cell_maps import CellMaps, cell_maps
@@ -26,6 +27,7 @@ from vtfs.frame import (
     FrameCounts,
     FrameInputs,
     Sizes,
+    cast_program,
     count,
     frame_program,
     image_on_host,
@@ -38,8 +40,9 @@ from vtfs.frame import (
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
 from vtfs.op_counts import ListLengths, OpCounts
-from vtfs.parameters import Configuration, configuration, counted_configuration
+from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration
 from vtfs.reference import forward_reference, image_error
+from vtfs.shadow_inputs import ShadowScene
 from vtfs.techniques import REGISTRY
 from vtfs.view_samples import ViewSamples
 
@@ -70,6 +73,7 @@ class ScenePath:
     samples: tuple[ViewSamples, ...]
     lights: Lights
     seed: int
+    shadow_scene: ShadowScene | None = None
 
 
 class SceneWorkload:
@@ -80,10 +84,11 @@ class SceneWorkload:
         self._compiles = compiles
         self._objective = objective
         self._inputs = [
-            FrameInputs(samples, path.lights, frame=frame)
+            FrameInputs(samples, path.lights, frame, shadow_scene=path.shadow_scene)
             for samples, frame in zip(path.samples, path.frames, strict=True)
         ]
         self._reference: np.ndarray | None = None
+        self._checker: ShadowChecker | None = None
         self._counted: dict[tuple[Configuration, int], FrameCounts] = {}
         self.device = device_name()
         self.frames = path.frames
@@ -166,7 +171,7 @@ class SceneWorkload:
         return cell_maps(config, self._inputs[0])
 
     def reference(self) -> np.ndarray:
-        """The float64 image of the frame with the most work."""
+        """The float64 image of the frame with the most work, without shadows."""
         if self._reference is None:
             samples, lights = self._path.samples[0], self._path.lights
             parts = (self.scene_key, f"frame {self.frames[0]}")
@@ -189,8 +194,15 @@ class SceneWorkload:
         if bool(overflowed):
             return "overflow", "a frame no longer fits the capacities that its sizing run found"
         valid = self._inputs[0].seen()
+        if REGISTRY[config.technique].casts_shadows:
+            checked = self._check_masks(config)
+            reference = checked.image
+            if checked.wrong and not changes_shadows(config):
+                return "failed", checked.wrong
+        else:
+            reference = self.reference()
         with np.errstate(invalid="ignore", over="ignore"):  # of an image that overflowed the error is infinite
-            taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), self.reference(), valid)
+            taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), reference, valid)
         if config.is_exact and not taken.error <= EXACT_ERROR:
             return "failed", f"error {taken.error:.2g} against the float64 reference; float32 explains {EXACT_ERROR:g}"
         # The first run's time may be the compiler's: only a second one is held against the configuration.
@@ -221,6 +233,14 @@ class SceneWorkload:
             env = env or run_stages(config, self._inputs[0], sizes)[0]
         taken.stages_ms = self._stages_ms(config, sizes, env) | {"frame": tuple(frames)}
         return "timed", ""
+
+    def _check_masks(self, config: Configuration) -> MaskCheck:
+        samples, shadows = self._path.samples[0], self._inputs[0].shadows
+        if self._checker is None:
+            key = (self.scene_key, f"frame {self.frames[0]}")
+            self._checker = ShadowChecker(shadows, samples, self._path.lights, key)
+        masks = cast_program(config.technique, planned(config, self._sizes_of(config)))(shadows.tasks(config))
+        return self._checker.check(config, masks_on_host(masks, samples))
 
     def _stages_ms(
         self, config: Configuration, sizes: Sizes, env: dict[str, Any]

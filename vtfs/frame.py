@@ -17,6 +17,7 @@ from vtfs.input_error import InputError
 from vtfs.light_assignment.brute_force import every_pair
 from vtfs.light_assignment.light_tree import reduce_lights, sort_lights
 from vtfs.light_lists import AssignCounts, ViewLights, view_lights
+from vtfs.light_shadows import CastMask
 from vtfs.lights import Lights
 from vtfs.morton import morton_codes
 from vtfs.op_counts import (
@@ -44,6 +45,7 @@ from vtfs.shadow_techniques import (
     on_host,
     shadow_plan,
     shadow_sizes,
+    shadows_counts,
     with_shadow_sizes,
 )
 from vtfs.techniques import REGISTRY, Plan, Stage, Walked, approximates, assign_chunk, volume_chunk
@@ -77,11 +79,9 @@ class Sizes:
 
     def covering(self, other: Sizes) -> Sizes:
         """What holds both; of the same technique and plan."""
-        shadow = (
-            tuple(max(a, b) for a, b in zip(self.shadow, other.shadow, strict=True))
-            if self.shadow and other.shadow
-            else self.shadow or other.shadow
-        )
+        shadow = self.shadow or other.shadow
+        if self.shadow and other.shadow:
+            shadow = tuple(map(max, self.shadow, other.shadow))
         return Sizes(max(self.cells, other.cells), max(self.blocks, other.blocks), max(self.pairs, other.pairs), shadow)
 
 
@@ -109,18 +109,18 @@ def rounded_up(name: str, needed: int) -> int:
 class FrameInputs:
     """One frame on the device: view samples and lights, uploaded once and used by every configuration.
 
-    - `shadow_scene`: what casts shadows; for shadow techniques.
     - `frame`: its number on the path: where `resort_every` divides it, the light tree is sorted.
     - `earlier_lights`: where lights were in an earlier frame, in its view space; where they are now unless given.
+    - `shadow_scene`: what casts shadows, for shadow techniques.
     """
 
     def __init__(
         self,
         samples: ViewSamples,
         lights: Lights,
-        shadow_scene: ShadowScene | None = None,
         frame: int = 0,
         earlier_lights: Callable[[int], ViewLights] | None = None,
+        shadow_scene: ShadowScene | None = None,
     ):
         self._shadow_scene = shadow_scene
         self._lights = lights
@@ -270,27 +270,34 @@ def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
 def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable[..., Any]:
     """All stages fused: from the inputs to the image and whether anything overflowed.
 
-    One program; of shadow techniques two, as shadows are found in float64 and shaded in float32: from view samples to
-    the mask of a light, run for each, and from the masks to the image.
+    One program; of shadow techniques two, as shadows are found in float64 and shaded in float32: `cast_program`, and
+    from its masks to the image.
     """
     stages = REGISTRY[technique].stages_of(plan, has_transparent)
     casting = tuple(stage for stage in stages if stage.per_shadow)
-    shading = tuple(stage for stage in stages if not stage.per_shadow)
-    image = _fused(shading, replace(plan, shadow=None))
+    image = _fused(tuple(stage for stage in stages if not stage.per_shadow), replace(plan, shadow=None))
     if not casting:
         return image
-    cast = _for_each_shadow(_fused_casting(casting, Plan(shadow=plan.shadow)))
+    cast = cast_program(technique, plan)
 
     def run(env: dict[str, Any]):
-        shading_env = {name: value for name, value in env.items() if name != "shadow_tasks"}
-        return image(shading_env | {casting[-1].name: cast(env["shadow_tasks"])})
+        shading = {name: value for name, value in env.items() if name != "shadow_tasks"}
+        return image(shading | {casting[-1].name: cast(env["shadow_tasks"])})
 
     return run
 
 
+def cast_program(technique: str, plan: Plan) -> Callable[[list[ShadowTask]], list[CastMask]]:
+    """From view samples to the mask of one light on one view, fused, and run for each of them."""
+    casting = tuple(stage for stage in REGISTRY[technique].stages if stage.per_shadow)
+    if len(casting) == 1:  # the same program: it is compiled once
+        return stage_program(casting[0], narrowed(casting[0], plan))
+    return _for_each_shadow(_fused_casting(casting, Plan(shadow=plan.shadow)))
+
+
 @functools.cache
-def _fused_casting(stages: tuple[Stage, ...], plan: Plan) -> Callable[..., Any]:
-    def run(task: ShadowTask):
+def _fused_casting(stages: tuple[Stage, ...], plan: Plan) -> Callable[[ShadowTask], CastMask]:
+    def run(task: ShadowTask) -> CastMask:
         env: dict[str, Any] = {"shadow_tasks": task}
         for stage in stages:
             env[stage.name] = stage.run(plan, *(env[name] for name in stage.needs))
@@ -413,8 +420,8 @@ class FrameCounts:
         technique = {str(name): int(value) for name, value in zip(arrays["names"], arrays["counts"], strict=True)}
         walk_rows = tuple(int(rows) for rows in arrays["walk_rows"])
         n_solid_blocks, light_runs, branching, cells, blocks, pairs, *shadow = (int(v) for v in arrays["scalars"])
-        walked: Walked = str(arrays["walked"])  # type: ignore[assignment]
         sizes = Sizes(cells, blocks, pairs, tuple(shadow))
+        walked: Walked = str(arrays["walked"])  # type: ignore[assignment]
         return cls(technique, arrays["of_block"], n_solid_blocks, walked, walk_rows, light_runs, branching, sizes)
 
 
@@ -457,17 +464,6 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     return frame_counts, lengths
 
 
-def _published_counts(config: Configuration, env: dict[str, Any], inputs: FrameInputs) -> AssignCounts:
-    """What the technique's own assigner does, however the lists of `env` were made."""
-    technique = REGISTRY[config.technique]
-    published = replace(technique.plan(config), assigner="published")
-    if technique.walked(published, inputs.n_lights) == "all_pairs":
-        return every_pair(int(env["clusters"].n_clusters), inputs.n_lights)
-    if technique.plan(config) == published:
-        return env["assign_counts"]
-    return run_stages(config.replaced(assigner="published"), inputs, until="assign")[0]["assign_counts"]
-
-
 def _count_shadowed(config: Configuration, inputs: FrameInputs, sizes: Sizes | None) -> tuple[FrameCounts, ListLengths]:
     """What shading does as for its lists, with what finding the shadows takes."""
     shading, lengths = count(lists_configuration(config), inputs, sizes)
@@ -478,8 +474,8 @@ def _count_shadowed(config: Configuration, inputs: FrameInputs, sizes: Sizes | N
     shadow: tuple[int, ...] = ()
     if config.technique not in SHADOW_REFERENCES:
         cast, shadow = cast_counted(config, inputs)
-        counts |= {name: sum(each.counts[name] for each in cast) for name in cast[0].counts}
-        counts["memory"] += shading.technique["memory"]
+        own = shadows_counts([each.counts for each in cast])
+        counts |= own | {"memory": counts["memory"] + own["memory"]}
     return replace(shading, technique=counts, sizes=replace(shading.sizes, shadow=shadow)), lengths
 
 
@@ -488,6 +484,17 @@ def cast_counted(config: Configuration, inputs: FrameInputs) -> tuple[list[CastS
     frames = [receiving(task) for task in inputs.shadows.tasks(config)]
     plan, masks = fitted_to_all(config.technique, shadow_plan(config), frames)
     return [on_host(mask, plan, frame) for mask, frame in zip(masks, frames, strict=True)], shadow_sizes(plan)
+
+
+def _published_counts(config: Configuration, env: dict[str, Any], inputs: FrameInputs) -> AssignCounts:
+    """What the technique's own assigner does, however the lists of `env` were made."""
+    technique = REGISTRY[config.technique]
+    published = replace(technique.plan(config), assigner="published")
+    if technique.walked(published, inputs.n_lights) == "all_pairs":
+        return every_pair(int(env["clusters"].n_clusters), inputs.n_lights)
+    if technique.plan(config) == published:
+        return env["assign_counts"]
+    return run_stages(config.replaced(assigner="published"), inputs, until="assign")[0]["assign_counts"]
 
 
 def is_listed(config: Configuration) -> bool:

@@ -166,13 +166,6 @@ PARAMETERS: dict[str, Parameter] = {
         ),
         Parameter("light_cutoff", 0.0, "lights reach only where their window is above this", low=0.0, high=0.99),
         Parameter(
-            "approximate",
-            0.0,
-            "lights that vary by at most this over a cluster, as a share of all light there, are evaluated once for it",
-            low=0.0,
-            high=1.0,
-        ),
-        Parameter(
             "planes", "on", "planes that reject nodes besides the four of a shadow volume", choices=("on", "off")
         ),
         Parameter(
@@ -199,6 +192,13 @@ PARAMETERS: dict[str, Parameter] = {
             "z-pass starts with the volumes around the eye; off, as in textbooks, it fails inside of one",
             choices=("on", "off"),
         ),
+        Parameter(
+            "approximate",
+            0.0,
+            "lights that vary by at most this over a cluster, as a share of all light there, are evaluated once for it",
+            low=0.0,
+            high=1.0,
+        ),
     )
 }
 
@@ -212,7 +212,7 @@ _BY_TREE = (*_TILES, *_SLICES, *_TREE, "batch", *_CLUSTERS, "leaf_test", *_SHADI
 _VOLUMES = ("tile_px", "branching", "batch", "planes", "feedback", "front_faces")
 _STENCIL = ("tile_px", "branching", "stencil", "front_faces")
 
-ACCURACY = ("gbuffer", "light_cutoff", "approximate")
+ACCURACY = ("gbuffer", "light_cutoff", "approximate", "front_faces", "stencil", "around_eye")
 """Parameters that change the image: their defaults are exact."""
 
 TECHNIQUES: dict[str, tuple[str, ...]] = {
@@ -244,9 +244,6 @@ SHADOW_REFERENCES = ("shadow_rays", "brute_force")
 LISTS_OF_SHADOWED = "clustered_deferred"
 """Whose light lists, at its defaults, a shadow technique shades with."""
 
-CHANGES_IMAGE = ("gbuffer", "light_cutoff", "front_faces", "stencil", "around_eye")
-"""Parameters whose other values trade accuracy for speed."""
-
 TUNED_TECHNIQUES = ("forward", "tiled_deferred", "volume_tiled_bvh")
 """What a search compares unless the user says otherwise. Nothing is rasterised here, so that techniques which differ
 in their passes over the geometry run the same programs: `tiled_forward_prez` those of `tiled_deferred`,
@@ -255,13 +252,13 @@ in their passes over the geometry run the same programs: `tiled_forward_prez` th
 _OWN_DEFAULTS: dict[tuple[str, str], Value] = {
     ("tiled_deferred", "bounds"): "depth_range",
     ("tiled_forward_prez", "bounds"): "depth_range",
+    ("cluster_hierarchy", "bounds"): "explicit",
+    **{(name, "tile_px"): 8 for name in ("z_pass", "z_fail", "ptsv", "cluster_hierarchy")},
     # What tells these from one another is how they make their lists.
     ("volume_tiled", "assigner"): "published",
     ("volume_tiled_bvh", "assigner"): "published",
     ("clustered_deferred", "assigner"): "published",
     ("clustered_forward", "assigner"): "published",
-    ("cluster_hierarchy", "bounds"): "explicit",
-    **{(name, "tile_px"): 8 for name in ("z_pass", "z_fail", "ptsv", "cluster_hierarchy")},
 }
 
 _OWN_CHOICES: dict[tuple[str, str], tuple[Value, ...]] = {("cluster_hierarchy", "bounds"): ("implicit", "explicit")}
@@ -302,7 +299,8 @@ class Configuration:
 
     def exact(self) -> Configuration:
         """The same without what trades accuracy for speed."""
-        return self.replaced(**{name: PARAMETERS[name].default for name in ACCURACY if name in self.params})
+        exact = {name: default_value(self.technique, name) for name in ACCURACY if name in self.params}
+        return self.replaced(**exact)
 
     @property
     def is_exact(self) -> bool:
@@ -335,6 +333,13 @@ def configuration(technique: str, params: Mapping[str, object] | None = None) ->
     }
     settled = _settled(technique, parsed)
     return Configuration(technique, tuple((name, settled[name]) for name in names))
+
+
+def changes_shadows(config: Configuration) -> bool:
+    """May its shadows be others than those of its casters, as those of a stencil of 8 bits?"""
+    return any(
+        config.params.get(name, value) != value for name, value in (("stencil", "unlimited"), ("around_eye", "on"))
+    )
 
 
 def lists_configuration(config: Configuration) -> Configuration:

@@ -100,7 +100,7 @@ def reflected(
 def _facing(
     surface: Surface, to: tuple[Float[Array, "*s"], ...], distance: Float[Array, "*s"] | float
 ) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
-    """`max(0, n.l)` times the distance, and `specular * max(0, n.h)**shininess`, of light from `to`, `distance` away."""
+    """`max(0, n.l)` times the distance, and `specular * max(0, n.h)**shininess` of light that comes from `to`."""
     n_x, n_y, n_z = surface.normal
     to_x, to_y, to_z = to
     n_dot_to = jnp.maximum(n_x * to_x + n_y * to_y + n_z * to_z, 0)
@@ -200,8 +200,8 @@ def shade(
     light_cutoff: Float[Array, ""],
     batch: int,
     transparent: bool = False,
-    cluster_light: ClusterLight | None = None,
     shadows: LightShadows | None = None,
+    cluster_light: ClusterLight | None = None,
 ) -> Image:
     """Shade every valid sample with its cluster's lights: linear red, green and blue, 0 where invalid.
 
@@ -211,8 +211,8 @@ def shade(
     **Arguments:**
 
     - `transparent`: shade the transparent runs, and return those; else the solid ones, and return the visible.
-    - `cluster_light`: what is not on the lists but adds to all samples of a cluster.
     - `shadows`: a light adds nothing where a sample lies in its shadow, and directional lights shine too.
+    - `cluster_light`: what is not on the lists but adds to all samples of a cluster.
     """
     capacity = clusters.block_run.shape[0]
     chunk = chunk_blocks(capacity, batch)
@@ -259,13 +259,13 @@ def shade(
         offset, count = block_offset[block], jnp.where(in_use, block_count[block], 0)
         part = jax.tree.map(lambda channel: channel[run], gbuffer)
         sums = tuple(e.astype(jnp.float32) for e in part.emissive)
-        if cluster_light is not None:
-            once = cluster_light.reflected_by(part, clusters.block_cluster[block])
-            sums = tuple(s + a for s, a in zip(sums, once, strict=True))
         shade_of = shadows.of_runs(run) if shadows is not None else None
         if shade_of is not None:
             surface = jax.tree.map(lambda channel: channel.astype(jnp.float32), surface_of(part))
             sums = tuple(s + a for s, a in zip(sums, reflected_suns(surface, shade_of), strict=True))
+        if cluster_light is not None:
+            once = cluster_light.reflected_by(part, clusters.block_cluster[block])
+            sums = tuple(s + a for s, a in zip(sums, once, strict=True))
         k = jnp.int32(0)
         for width, narrower in zip(widths, (*widths[1:], 0), strict=True):
             # Not the first one's length: very long lists are not in order among themselves.

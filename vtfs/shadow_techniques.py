@@ -308,6 +308,20 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
     }
 
 
+def shadows_counts(of_each: Sequence[dict[str, int]]) -> dict[str, int]:
+    """Counts of the shadows of several lights and views: sums, but what is held or longest is that of the largest.
+
+    Names that shading has too are told apart: `shadow_samples` receive shadow, `shadow_clusters` are what is walked.
+    """
+    largest = {"memory", "longest_list", "casters"}
+    total = {
+        name: (max if name in largest else sum)(counts.get(name, 0) for counts in of_each)
+        for name in dict.fromkeys(name for counts in of_each for name in counts)
+    }
+    names = {"samples": "shadow_samples", "items": "shadow_clusters", "longest_list": "longest_shadow_list"}
+    return {names.get(name, name): value for name, value in total.items()}
+
+
 def _memory(plan: ShadowPlan, frame: ShadowFrame) -> int:
     """Lists of all levels that are held at once, planes of all triangles, and the tree."""
     groups = sum(plan.level_groups) if plan.level_groups else 2 * plan.groups

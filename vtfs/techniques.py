@@ -95,8 +95,8 @@ class Plan:
 class Stage:
     """One step of a frame, timed apart.
 
-    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`, `approximate`; for
-      kept orders `old_order`, `frame`, `resort_every`; of shadow techniques `shadow_tasks` and `shadow_slots`) and
+    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`, `approximate`, for
+      kept orders `old_order`, `frame`, `resort_every`, of shadow techniques `shadow_tasks` and `shadow_slots`) and
       earlier stages. `listed` are the lists as assigned, `assign` those without what is evaluated once a cluster, and
       `cluster_light` is that, or None.
     - `statics`: the fields of `Plan` that its program depends on.
@@ -324,7 +324,7 @@ def _shade_transparent(
     lists: LightLists,
     cluster_light: ClusterLight | None = None,
 ) -> Image:
-    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, cluster_light)
+    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, cluster_light=cluster_light)
     return blend_layers(solid, colour, layers)
 
 
@@ -361,7 +361,7 @@ def _shade_transparent_shadowed(
     lists: LightLists,
     shadows: LightShadows,
 ) -> Image:
-    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, shadows)
+    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, shadows=shadows)
     return blend_layers(solid, colour, layers)
 
 
@@ -458,8 +458,9 @@ def _shadowed(name: str) -> Technique:
     """Masks of all lights that cast, then clustered shading. References bring their masks from the host."""
     run = functools.partial(_cast, name)
     cast = Stage("shadow_traverse", run, ("shadow_tasks",), ("shadow",), per_shadow=True)
-    stages = (_MERGE_SHADOWS, _CLUSTERS, *_ASSIGN_BY_TREE, *_SHADE_SHADOWED)
-    return Technique(name, stages if name in SHADOW_REFERENCES else (cast, *stages), reads_gbuffer="per_sample")
+    casting = (_MERGE_SHADOWS,) if name in SHADOW_REFERENCES else (cast, _MERGE_SHADOWS)
+    stages = (_CLUSTERS, *_ASSIGN_BY_TREE, *casting, *_SHADE_SHADOWED)
+    return Technique(name, stages, reads_gbuffer="per_sample")
 
 
 _TILED = (_CLUSTERS, _ASSIGN_BRUTE_FORCE, _APPROXIMATE, *_SHADE)

@@ -79,6 +79,7 @@ def test_defaults_are_those_of_the_design():
         "branching": 32, "assigner": "auto", "batch": 0, "bounds": "implicit", "cull": "box", "leaf_test": "sphere",
         "unique": "page_table", "normal_bins": 0, "normal_cones": "implicit", "gbuffer": "float32", "light_cutoff": 0.0,
         "prepass": "on", "approximate": 0.0, "resort_every": 1,
+        "planes": "on", "front_faces": "cast", "feedback": "on", "stencil": "unlimited", "around_eye": "on",
     }  # fmt: skip
     # Tiles had their samples' depths before there was a choice (Olsson and Assarsson 2011).
     own = {(t, n): default_value(t, n) for t, names in TECHNIQUES.items() for n in names}
@@ -90,6 +91,8 @@ def test_defaults_are_those_of_the_design():
             (name, "assigner"): "published"
             for name in ("volume_tiled", "volume_tiled_bvh", "clustered_deferred", "clustered_forward")
         },
+        **{(name, "tile_px"): 8 for name in ("z_pass", "z_fail", "ptsv", "cluster_hierarchy")},
+        ("cluster_hierarchy", "bounds"): "explicit",
     }
 
 
