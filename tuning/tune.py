@@ -152,7 +152,7 @@ def choose_frames(setup: SceneSetup) -> tuple[int, ...]:
 
 
 def _inputs(setup: SceneSetup, frame: int) -> FrameInputs:
-    return FrameInputs(setup.samples(frame), setup.lights)
+    return setup.inputs(frame)
 
 
 def _config(measurement: Measurement) -> Configuration:
@@ -197,8 +197,7 @@ def _stages(found: SearchResult, objective: Objective) -> dict[str, dict[str, fl
     stages: dict[str, dict[str, float]] = {}
     fastest: dict[str, Measurement] = {}
     for m in found.measurements:
-        exact = m.params.get("gbuffer") == "float32" and m.params.get("light_cutoff") == 0
-        if is_timed(m) and exact:
+        if is_timed(m) and is_exact(_config(m)):
             fastest[m.technique] = min(fastest.get(m.technique, m), m, key=lambda m: time_ms(m, objective))
     for technique, m in fastest.items():
         stages[technique] = {name: float(np.median(frames[0])) for name, frames in m.stages_ms.items()}

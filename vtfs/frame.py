@@ -15,6 +15,7 @@ from vtfs.cluster_grid import cluster_grid, configured_grid, n_cells, n_keys, ti
 from vtfs.gbuffer import RUN_WIDTH_PX, Fragments, GBuffer, LayerTable, Positions, from_runs
 from vtfs.input_error import InputError
 from vtfs.light_lists import view_lights
+from vtfs.light_shadows import CastMask
 from vtfs.lights import Lights
 from vtfs.op_counts import (
     ListLengths,
@@ -32,7 +33,17 @@ from vtfs.op_counts import (
     uniform_lengths,
     walk_rows,
 )
-from vtfs.parameters import PARAMETERS, Configuration
+from vtfs.parameters import PARAMETERS, SHADOW_REFERENCES, Configuration, lists_configuration, shading_batch
+from vtfs.shadow_inputs import FrameShadows, ShadowScene, ShadowTask, receiving
+from vtfs.shadow_techniques import (
+    CastShadows,
+    fitted_to_all,
+    on_host,
+    shadow_plan,
+    shadow_sizes,
+    shadows_counts,
+    with_shadow_sizes,
+)
 from vtfs.techniques import REGISTRY, Plan, Stage, volume_chunk, walk_chunk
 from vtfs.view_samples import ViewSamples
 
@@ -52,14 +63,20 @@ class Sizes:
 
     - `cells`: of the grid's page table; `blocks`: of clusters and of their blocks; `pairs`: of the
       (cluster, light) pairs and of every level on the way to them.
+    - `shadow`: of shadow techniques, see `shadow_sizes`.
     """
 
     cells: int
     blocks: int
     pairs: int
+    shadow: tuple[int, ...] = ()
 
     def covering(self, other: Sizes) -> Sizes:
-        return Sizes(max(self.cells, other.cells), max(self.blocks, other.blocks), max(self.pairs, other.pairs))
+        """What holds both; of the same technique and plan."""
+        shadow = self.shadow or other.shadow
+        if self.shadow and other.shadow:
+            shadow = tuple(map(max, self.shadow, other.shadow))
+        return Sizes(max(self.cells, other.cells), max(self.blocks, other.blocks), max(self.pairs, other.pairs), shadow)
 
 
 NO_SIZES = Sizes(0, 0, 0)
@@ -86,7 +103,9 @@ def rounded_up(name: str, needed: int) -> int:
 class FrameInputs:
     """One frame on the device: view samples and lights, uploaded once and used by every configuration."""
 
-    def __init__(self, samples: ViewSamples, lights: Lights):
+    def __init__(self, samples: ViewSamples, lights: Lights, shadow_scene: ShadowScene | None = None):
+        self._shadow_scene = shadow_scene
+        self._lights = lights
         self.samples = samples
         self.camera = samples.camera
         self.viewport = samples.camera.viewport
@@ -97,6 +116,16 @@ class FrameInputs:
         self._fragments: dict[bool, Fragments] = {}
         self._positions: dict[bool, Positions] = {}
         self._gbuffers: dict[tuple[bool, str], GBuffer] = {}
+
+    @cached_property
+    def shadows(self) -> FrameShadows:
+        """What casts on this frame.
+
+        **Raises:** `InputError` where there is no geometry, or no light that casts.
+        """
+        if self._shadow_scene is None:
+            raise InputError("shadow techniques need the triangles of a scene: give a scene file, not a G-buffer.")
+        return FrameShadows(self._shadow_scene, self.samples, self._lights)
 
     @cached_property
     def layers(self) -> LayerTable:
@@ -129,7 +158,7 @@ class FrameInputs:
 
     def environment(self, config: Configuration) -> dict[str, Any]:
         """What the stages of a configuration start from, by the names that `Stage.needs` uses."""
-        params = config.params
+        params = lists_configuration(config).params
         technique = REGISTRY[config.technique]
         with_hidden = technique.shades_hidden(config)
         env: dict[str, Any] = {
@@ -146,18 +175,36 @@ class FrameInputs:
             env["normals"] = env["gbuffer"].normal if needs_normals else None
         elif technique.lists == "light_volumes":  # for its pixels
             env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
+        if technique.casts_shadows:
+            env["shadow_slots"] = self.shadows.slots
+            if config.technique in SHADOW_REFERENCES:
+                env["shadow_traverse"] = self.shadows.reference_masks(config)
+            else:
+                env["shadow_tasks"] = self.shadows.tasks(config)
         return env
 
 
 def planned(config: Configuration, sizes: Sizes) -> Plan:
     plan = REGISTRY[config.technique].plan(config)
-    return replace(plan, cells=sizes.cells, blocks=sizes.blocks, pairs=sizes.pairs)
+    shadow = with_shadow_sizes(plan.shadow, sizes.shadow) if plan.shadow else None
+    return replace(plan, cells=sizes.cells, blocks=sizes.blocks, pairs=sizes.pairs, shadow=shadow)
 
 
 @functools.cache
 def stage_program(stage: Stage, plan: Plan) -> Callable[..., Any]:
     """One stage as a program of its own. `plan` holds only what the stage names: see `narrowed`."""
-    return jax.jit(functools.partial(stage.run, plan))
+    program = jax.jit(functools.partial(stage.run, plan))
+    return _for_each_shadow(program) if stage.per_shadow else program
+
+
+def _for_each_shadow(program: Callable[..., Any]) -> Callable[..., list[Any]]:
+    """Run for each light that casts and each view, in float64."""
+
+    def run(*lists: list[Any]) -> list[Any]:
+        with jax.enable_x64(True):
+            return [program(*each) for each in zip(*lists, strict=True)]
+
+    return run
 
 
 def narrowed(stage: Stage, plan: Plan) -> Plan:
@@ -175,8 +222,42 @@ def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
 
 
 def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable[..., Any]:
-    """All stages fused in one program: from the inputs to the image and whether anything overflowed."""
-    return _fused(REGISTRY[technique].stages_of(has_transparent), plan)
+    """All stages fused: from the inputs to the image and whether anything overflowed.
+
+    One program; of shadow techniques two, as shadows are found in float64 and shaded in float32: `cast_program`, and
+    from its masks to the image.
+    """
+    stages = REGISTRY[technique].stages_of(has_transparent)
+    casting = tuple(stage for stage in stages if stage.per_shadow)
+    image = _fused(tuple(stage for stage in stages if not stage.per_shadow), replace(plan, shadow=None))
+    if not casting:
+        return image
+    cast = cast_program(technique, plan)
+
+    def run(env: dict[str, Any]):
+        shading = {name: value for name, value in env.items() if name != "shadow_tasks"}
+        return image(shading | {casting[-1].name: cast(env["shadow_tasks"])})
+
+    return run
+
+
+def cast_program(technique: str, plan: Plan) -> Callable[[list[ShadowTask]], list[CastMask]]:
+    """From view samples to the mask of one light on one view, fused, and run for each of them."""
+    casting = tuple(stage for stage in REGISTRY[technique].stages if stage.per_shadow)
+    if len(casting) == 1:  # the same program: it is compiled once
+        return stage_program(casting[0], narrowed(casting[0], plan))
+    return _for_each_shadow(_fused_casting(casting, Plan(shadow=plan.shadow)))
+
+
+@functools.cache
+def _fused_casting(stages: tuple[Stage, ...], plan: Plan) -> Callable[[ShadowTask], CastMask]:
+    def run(task: ShadowTask) -> CastMask:
+        env: dict[str, Any] = {"shadow_tasks": task}
+        for stage in stages:
+            env[stage.name] = stage.run(plan, *(env[name] for name in stage.needs))
+        return env[stages[-1].name]
+
+    return jax.jit(run)
 
 
 @functools.cache
@@ -186,8 +267,7 @@ def _fused(stages: tuple[Stage, ...], plan: Plan) -> Callable[..., Any]:
         env = dict(env)
         for stage in stages:
             keep_result(env, stage.name, stage.run(plan, *(env[name] for name in stage.needs)))
-        overflowed = [env["clusters"].overflowed] if "clusters" in env else []
-        overflowed += [env["assign"].overflowed] if "assign" in env else []
+        overflowed = [env[name].overflowed for name in ("clusters", "assign", "shadow_merge") if name in env]
         return env[stages[-1].name], jax.numpy.stack(overflowed).any() if overflowed else np.bool_(False)
 
     return jax.jit(run)
@@ -215,6 +295,8 @@ def run_stages(
         grid_keys *= 2
     fitting = Sizes(rounded_up("cells", grid_keys), rounded_up("blocks", n_runs), rounded_up("pairs", 0))
     sizes = fitting.covering(sizes) if sizes else fitting
+    if "shadow_tasks" in env and not sizes.shadow:
+        sizes = replace(sizes, shadow=cast_counted(config, inputs)[1])
     for stage in technique.stages_of(inputs.has_transparent):
         while True:
             plan = narrowed(stage, planned(config, sizes))
@@ -269,9 +351,13 @@ class FrameCounts:
             own = added(own, light_volume_batch_counts(self.light_runs, volume_chunk(self.sizes.pairs, batch)))
         return self.technique | own
 
+    def of(self, config: Configuration) -> OpCounts:
+        """All counts of one of the configurations that have these."""
+        return self.at_batch(shading_batch(config))
+
     def as_arrays(self) -> dict[str, np.ndarray]:
         """For a cache; the inverse of `from_arrays`."""
-        sizes = (self.sizes.cells, self.sizes.blocks, self.sizes.pairs)
+        sizes = (self.sizes.cells, self.sizes.blocks, self.sizes.pairs, *self.sizes.shadow)
         return {
             "names": np.array(list(self.technique)),
             "counts": np.array(list(self.technique.values()), np.int64),
@@ -284,12 +370,15 @@ class FrameCounts:
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> FrameCounts:
         technique = {str(name): int(value) for name, value in zip(arrays["names"], arrays["counts"], strict=True)}
         walk_rows = tuple(int(rows) for rows in arrays["walk_rows"])
-        n_solid_blocks, light_runs, branching, *sizes = (int(value) for value in arrays["scalars"])
-        return cls(technique, arrays["of_block"], n_solid_blocks, walk_rows, light_runs, branching, Sizes(*sizes))
+        n_solid_blocks, light_runs, branching, cells, blocks, pairs, *shadow = (int(v) for v in arrays["scalars"])
+        sizes = Sizes(cells, blocks, pairs, tuple(shadow))
+        return cls(technique, arrays["of_block"], n_solid_blocks, walk_rows, light_runs, branching, sizes)
 
 
 def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None) -> tuple[FrameCounts, ListLengths]:
     """Count what a configuration does on a frame; nothing is shaded."""
+    if REGISTRY[config.technique].casts_shadows:
+        return _count_shadowed(config, inputs, sizes)
     technique = REGISTRY[config.technique]
     if is_listed(config):
         env, sizes = run_stages(config, inputs, sizes, until="assign")
@@ -318,6 +407,28 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     counts |= gbuffer_traffic(technique.reads_gbuffer, counts)
     frame_counts = FrameCounts(counts, lengths.of_block, lengths.n_solid_blocks, rows, light_runs, branching, sizes)
     return frame_counts, lengths
+
+
+def _count_shadowed(config: Configuration, inputs: FrameInputs, sizes: Sizes | None) -> tuple[FrameCounts, ListLengths]:
+    """What shading does as for its lists, with what finding the shadows takes."""
+    shading, lengths = count(lists_configuration(config), inputs, sizes)
+    counts = dict(shading.technique)
+    suns = inputs.shadows.scene.suns.n_lights
+    counts["lighting_computations"] += suns * counts["samples"]
+    counts["shadow_lights"] = len(inputs.shadows.lights)
+    shadow: tuple[int, ...] = ()
+    if config.technique not in SHADOW_REFERENCES:
+        cast, shadow = cast_counted(config, inputs)
+        own = shadows_counts([each.counts for each in cast])
+        counts |= own | {"memory": counts["memory"] + own["memory"]}
+    return replace(shading, technique=counts, sizes=replace(shading.sizes, shadow=shadow)), lengths
+
+
+def cast_counted(config: Configuration, inputs: FrameInputs) -> tuple[list[CastShadows], tuple[int, ...]]:
+    """Shadows of all lights on each view, with tests and counts, and the capacities that hold them."""
+    frames = [receiving(task) for task in inputs.shadows.tasks(config)]
+    plan, masks = fitted_to_all(config.technique, shadow_plan(config), frames)
+    return [on_host(mask, plan, frame) for mask, frame in zip(masks, frames, strict=True)], shadow_sizes(plan)
 
 
 def is_listed(config: Configuration) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vtfs.input_error import InputError
 
@@ -101,11 +101,11 @@ PARAMETERS: dict[str, Parameter] = {
             "how slices grow: by a factor, not at all, or as the values of the depth buffer",
             choices=("self_similar", "linear", "ndc"),
         ),
-        Parameter("branching", 32, "children of a node of the light tree", choices=(2, 4, 8, 16, 32, 64)),
+        Parameter("branching", 32, "children of a node of the tree", choices=(2, 4, 8, 16, 32, 64)),
         Parameter(
             "batch",
             0,
-            "queries in one chunk: clusters when assigning, samples when shading; "
+            "queries in one chunk: clusters when assigning, samples when shading, triangles when casting shadows; "
             "0: all at once (on a CPU: what fits its cache)",
             choices=_BATCHES,
         ),
@@ -149,6 +149,33 @@ PARAMETERS: dict[str, Parameter] = {
             choices=("float32", "float16", "bfloat16"),
         ),
         Parameter("light_cutoff", 0.0, "lights reach only where their window is above this", low=0.0, high=0.99),
+        Parameter(
+            "planes", "on", "planes that reject nodes besides the four of a shadow volume", choices=("on", "off")
+        ),
+        Parameter(
+            "front_faces",
+            "cast",
+            "triangles that face the light: they cast shadows, or are culled, which is right for closed meshes",
+            choices=("cast", "culled"),
+        ),
+        Parameter(
+            "feedback",
+            "on",
+            "triangles go on only into nodes that no other one has shadowed as a whole",
+            choices=("on", "off"),
+        ),
+        Parameter(
+            "stencil",
+            "unlimited",
+            "counts of a stencil: without limit, or 8 bits that wrap or saturate",
+            choices=("unlimited", "wrap", "saturate"),
+        ),
+        Parameter(
+            "around_eye",
+            "on",
+            "z-pass starts with the volumes around the eye; off, as in textbooks, it fails inside of one",
+            choices=("on", "off"),
+        ),
     )
 }
 
@@ -158,6 +185,8 @@ _CLUSTERS = ("bounds", "cull", "unique", "normal_bins", "normal_cones")
 _SHADING = ("gbuffer", "light_cutoff")
 _BRUTE_FORCE = ("batch", *_CLUSTERS, *_SHADING)
 _BY_TREE = (*_TILES, *_SLICES, "branching", "batch", *_CLUSTERS, "leaf_test", *_SHADING)
+_VOLUMES = ("tile_px", "branching", "batch", "planes", "feedback", "front_faces")
+_STENCIL = ("tile_px", "branching", "stencil", "front_faces")
 
 TECHNIQUES: dict[str, tuple[str, ...]] = {
     "forward": ("prepass", "batch", *_SHADING),
@@ -170,8 +199,26 @@ TECHNIQUES: dict[str, tuple[str, ...]] = {
     "clustered_forward": _BY_TREE,
     "volume_tiled": (*_TILES, *_SLICES, *_BRUTE_FORCE),
     "volume_tiled_bvh": _BY_TREE,
+    "z_pass": (*_STENCIL, "around_eye", *_SHADING),
+    "z_fail": (*_STENCIL, *_SHADING),
+    "ptsv": (*_VOLUMES, *_SHADING),
+    "cluster_hierarchy": ("tile_px", "depth_slices", "bounds", *_VOLUMES[1:], *_SHADING),
+    "shadow_rays": ("front_faces", *_SHADING),
+    "brute_force": ("front_faces", *_SHADING),
 }
 """Techniques and the parameters each one has, in the order in which they are shown."""
+
+SHADOW_NAMES = ("z_pass", "z_fail", "ptsv", "cluster_hierarchy", "shadow_rays", "brute_force")
+"""Those that find which samples lie in the shadow of which light, and then shade by `LISTS_OF_SHADOWED`."""
+
+SHADOW_REFERENCES = ("shadow_rays", "brute_force")
+"""What the others are checked against; they run on the host."""
+
+LISTS_OF_SHADOWED = "clustered_deferred"
+"""Whose light lists, at its defaults, a shadow technique shades with."""
+
+CHANGES_IMAGE = ("gbuffer", "light_cutoff", "front_faces", "stencil", "around_eye")
+"""Parameters whose other values trade accuracy for speed."""
 
 TUNED_TECHNIQUES = ("forward", "tiled_deferred", "volume_tiled_bvh")
 """What a search compares unless the user says otherwise. Nothing is rasterised here, so that techniques which differ
@@ -181,12 +228,23 @@ in their passes over the geometry run the same programs: `tiled_forward_prez` th
 _OWN_DEFAULTS: dict[tuple[str, str], Value] = {
     ("tiled_deferred", "bounds"): "depth_range",
     ("tiled_forward_prez", "bounds"): "depth_range",
+    ("cluster_hierarchy", "bounds"): "explicit",
+    **{(name, "tile_px"): 8 for name in ("z_pass", "z_fail", "ptsv", "cluster_hierarchy")},
 }
+
+_OWN_CHOICES: dict[tuple[str, str], tuple[Value, ...]] = {("cluster_hierarchy", "bounds"): ("implicit", "explicit")}
 
 
 def default_value(technique: str, name: str) -> Value:
     """What a technique does where the configuration does not say."""
     return _OWN_DEFAULTS.get((technique, name), PARAMETERS[name].default)
+
+
+def parameter_of(technique: str, name: str) -> Parameter:
+    """A parameter with the default and the choices that a technique has."""
+    parameter = PARAMETERS[name]
+    choices = _OWN_CHOICES.get((technique, name), parameter.choices)
+    return replace(parameter, default=default_value(technique, name), choices=choices)
 
 
 @dataclass(frozen=True)
@@ -232,9 +290,47 @@ def configuration(technique: str, params: Mapping[str, object] | None = None) ->
             raise InputError(f"parameter `{name}`: unknown; `{technique}` has {', '.join(names)}.")
         if name not in names:
             raise InputError(f"parameter `{name}`: `{technique}` does not have it; it has {', '.join(names)}.")
-    parsed = {name: PARAMETERS[name].parse(given.get(name, default_value(technique, name))) for name in names}
+    parsed = {
+        name: parameter_of(technique, name).parse(given.get(name, default_value(technique, name))) for name in names
+    }
     settled = _settled(technique, parsed)
     return Configuration(technique, tuple((name, settled[name]) for name in names))
+
+
+def exact_configuration(config: Configuration) -> Configuration:
+    """The same without what trades accuracy for speed."""
+    names = [name for name in CHANGES_IMAGE if name in config.params]
+    return config.replaced(**{name: default_value(config.technique, name) for name in names})
+
+
+def is_exact(config: Configuration) -> bool:
+    """Must its image be that of the reference?"""
+    return config == exact_configuration(config)
+
+
+def changes_shadows(config: Configuration) -> bool:
+    """May its shadows be others than those of its casters, as those of a stencil of 8 bits?"""
+    return any(
+        config.params.get(name, value) != value for name, value in (("stencil", "unlimited"), ("around_eye", "on"))
+    )
+
+
+def lists_configuration(config: Configuration) -> Configuration:
+    """The configuration whose light lists a frame is shaded with: its own, but for shadow techniques."""
+    if config.technique not in SHADOW_NAMES:
+        return config
+    return configuration(LISTS_OF_SHADOWED, {name: config[name] for name in _SHADING})
+
+
+def counted_configuration(config: Configuration) -> Configuration:
+    """The configuration that has the same counts of technique: a batch of clusters or samples changes none of them,
+    a batch of triangles does where what it shadows is left out afterwards."""
+    return config if config.technique in SHADOW_NAMES else config.replaced(batch=0)
+
+
+def shading_batch(config: Configuration) -> int:
+    """Samples that are shaded at once; 0: all."""
+    return int(lists_configuration(config)["batch"])
 
 
 def _settled(technique: str, params: dict[str, Value]) -> dict[str, Value]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import jax
@@ -26,11 +26,15 @@ from vtfs.light_assignment.light_tree import (
 )
 from vtfs.light_culling import Cull, LeafTest, needs_sections
 from vtfs.light_lists import AssignCounts, LightLists, ViewLights
+from vtfs.light_shadows import CastMask, LightShadows, ShadowSlots, merge_shadows
 from vtfs.light_volumes import LightPixels, draw_light_volumes, shade_light_volumes
 from vtfs.morton import morton_codes
 from vtfs.normal_cones import Components, ConeKind
-from vtfs.parameters import Configuration
+from vtfs.parameters import SHADOW_NAMES, SHADOW_REFERENCES, Configuration, lists_configuration
 from vtfs.shading import Image, blend_layers, chunk_blocks, shade
+from vtfs.shadow_inputs import ShadowTask, with_receivers
+from vtfs.shadow_mask import ShadowPlan
+from vtfs.shadow_techniques import SHADOW_TECHNIQUES, shadow_plan
 
 _TESTS_AT_ONCE = {"cpu": 2**19, "gpu": 2**22}
 """`batch = 0` means all queries at once, as far as their rows of boxes stay in the cache of a CPU (12 MB) or leave
@@ -43,6 +47,7 @@ class Plan:
 
     - `two_lists`: transparent samples have lists of their own.
     - `cells`, `blocks`, `pairs`: rounded capacities (see `frame.Sizes`).
+    - `shadow`: of shadow techniques, with capacities of its own.
     """
 
     bounds: Bounds = "implicit"
@@ -57,21 +62,25 @@ class Plan:
     cells: int = 0
     blocks: int = 0
     pairs: int = 0
+    shadow: ShadowPlan | None = None
 
 
 @dataclass(frozen=True)
 class Stage:
     """One step of a frame, timed apart.
 
-    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`) and earlier
-      stages.
+    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`, of shadow
+      techniques `shadow_tasks` and `shadow_slots`) and earlier stages.
     - `statics`: the fields of `Plan` that its program depends on.
+    - `per_shadow`: it runs once for each light that casts and each view, in float64: what it needs and its results are
+      lists.
     """
 
     name: str
     run: Callable[..., Any]
     needs: tuple[str, ...]
     statics: tuple[str, ...] = ()
+    per_shadow: bool = False
 
 
 Lists = Literal["clusters", "light_volumes", "none"]
@@ -96,8 +105,15 @@ class Technique:
     without_prepass: bool = False
     reads_gbuffer: Literal["never", "per_sample", "per_light"] = "never"
 
+    @property
+    def casts_shadows(self) -> bool:
+        return any(stage.name == "shadow_merge" for stage in self.stages)
+
     def plan(self, config: Configuration) -> Plan:
         """The static part of a configuration, without capacities."""
+        if self.casts_shadows:
+            lists = lists_configuration(config)
+            return replace(REGISTRY[lists.technique].plan(lists), shadow=shadow_plan(config))
         params = config.params
         return Plan(
             bounds=params.get("bounds", "implicit"),  # type: ignore[arg-type]
@@ -213,6 +229,43 @@ def _shade_transparent(
     return blend_layers(solid, colour, layers)
 
 
+def _cast(technique: str, plan: Plan, task: ShadowTask) -> CastMask:
+    assert plan.shadow is not None
+    mask = SHADOW_TECHNIQUES[technique](with_receivers(task), plan.shadow)
+    return mask.shadowed, mask.overflowed
+
+
+def _merge_shadows(plan: Plan, masks: list[CastMask], slots: ShadowSlots, layers: LayerTable) -> LightShadows:
+    return merge_shadows(masks, slots, layers)
+
+
+def _shade_shadowed(
+    plan: Plan,
+    gbuffer: GBuffer,
+    lights: ViewLights,
+    light_cutoff,
+    clusters: Clusters,
+    lists: LightLists,
+    shadows: LightShadows,
+) -> Image:
+    return shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, shadows=shadows)
+
+
+def _shade_transparent_shadowed(
+    plan: Plan,
+    gbuffer: GBuffer,
+    layers: LayerTable,
+    lights: ViewLights,
+    light_cutoff,
+    solid: Image,
+    clusters: Clusters,
+    lists: LightLists,
+    shadows: LightShadows,
+) -> Image:
+    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, shadows)
+    return blend_layers(solid, colour, layers)
+
+
 def _shade_forward(plan: Plan, gbuffer: GBuffer, lights: ViewLights, light_cutoff) -> Image:
     clusters = everything(gbuffer.positions)
     return _shade(plan, gbuffer, lights, light_cutoff, clusters, _all_lights(lights, clusters))
@@ -273,6 +326,27 @@ def _deferred(name: str, stencil: bool) -> Technique:
     return Technique(name, stages, lists="light_volumes", reads_gbuffer="per_light")
 
 
+_MERGE_SHADOWS = Stage("shadow_merge", _merge_shadows, ("shadow_traverse", "shadow_slots", "layers"))
+_SHADE_SHADOWED = (
+    Stage("shade_opaque", _shade_shadowed, ("gbuffer", *_LIGHTS, "clusters", "assign", "shadow_merge"), ("batch",)),
+    Stage(
+        "shade_transparent",
+        _shade_transparent_shadowed,
+        ("gbuffer", "layers", *_LIGHTS, "shade_opaque", "clusters", "assign", "shadow_merge"),
+        ("batch",),
+    ),
+)
+
+
+def _shadowed(name: str) -> Technique:
+    """Masks of all lights that cast, then clustered shading. References bring their masks from the host."""
+    run = functools.partial(_cast, name)
+    cast = Stage("shadow_traverse", run, ("shadow_tasks",), ("shadow",), per_shadow=True)
+    casting = (_MERGE_SHADOWS,) if name in SHADOW_REFERENCES else (cast, _MERGE_SHADOWS)
+    stages = (_CLUSTERS, *_ASSIGN_BY_TREE, *casting, *_SHADE_SHADOWED)
+    return Technique(name, stages, reads_gbuffer="per_sample")
+
+
 _TILED = (_CLUSTERS, _ASSIGN_BRUTE_FORCE, *_SHADE)
 _CLUSTERED = (_CLUSTERS, *_ASSIGN_BY_TREE, *_SHADE)
 
@@ -299,5 +373,6 @@ REGISTRY: dict[str, Technique] = {
         Technique("clustered_forward", _CLUSTERED),
         Technique("volume_tiled", _TILED),
         Technique("volume_tiled_bvh", _CLUSTERED),
+        *map(_shadowed, SHADOW_NAMES),
     )
 }
