@@ -22,7 +22,7 @@ from vtfs.device import versions
 from vtfs.files import write_atomically
 from vtfs.frame import FrameInputs
 from vtfs.image import exposure, heat_map, tone_map, write_png
-from vtfs.parameters import Configuration, configuration
+from vtfs.parameters import Configuration, configuration, is_exact
 from vtfs.scene_setup import SceneSetup
 
 DEFAULT_BUDGET = Budget(seconds=90.0)

@@ -31,7 +31,6 @@ from vtfs.frame import (
     frame_program,
     image_on_host,
     is_listed,
-    narrowed,
     planned,
     run_stages,
     stage_program,
@@ -241,7 +240,7 @@ class SceneWorkload:
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:
-            program = stage_program(stage, narrowed(stage, planned(config, sizes)))
+            program = stage_program(stage, stage.narrowed(planned(config, sizes)))
             arguments = [env[name] for name in stage.needs]
 
             def run(program: Callable = program, arguments: list = arguments) -> None:
