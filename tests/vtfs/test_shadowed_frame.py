@@ -7,7 +7,6 @@ import pytest
 
 from tests import oracles
 from tests.strategies import a_camera, layered_samples, nearby_lights, surface_samples
-from tests.vtfs.test_shadow_mask import soup
 from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
 from vtfs.frame import FrameInputs, count, image_on_host, render, run_stages
 from vtfs.input_error import InputError
@@ -18,6 +17,7 @@ from vtfs.reference import ViewShadows, forward_reference, largest_relative_diff
 from vtfs.shadow_casters import Casters
 from vtfs.shadow_inputs import FrameShadows, ShadowScene, brightest_lights
 from vtfs.shadow_maps import shadow_maps
+from vtfs.view_samples import ViewSamples
 
 SUNS = DirectionalLights(np.array([[0.3, 1.0, 0.4], [-2.0, 0.5, 0.0]]), np.array([[1.0, 0.9, 0.7], [0.2, 0.3, 0.6]]))
 NOTHING = Casters(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
@@ -25,11 +25,23 @@ CAST = configuration("cluster_hierarchy", {"branching": 8})
 """Of the walks only one, and only from points: each compiles for seconds. `test_shadow_mask` has the others."""
 
 
+def between(samples: ViewSamples, lights: Lights, seed: int, n: int = 200) -> Casters:
+    """Triangles on the way from visible samples to lights that reach them."""
+    rng = np.random.default_rng(seed)
+    at = samples.world_positions_m()
+    reached = np.linalg.norm(at[:, None] - lights.position_m, axis=-1) < lights.range_m
+    sample, light = np.argwhere(reached)[rng.integers(0, reached.sum(), n)].T
+    way = lights.position_m[light] - at[sample]
+    middle = at[sample] + rng.uniform(0.2, 0.8, (n, 1)) * way
+    size = 0.4 * np.linalg.norm(way, axis=1)[:, None, None]
+    corners = middle[:, None] + size * rng.normal(size=(n, 3, 3))
+    return Casters(corners.reshape(-1, 3), np.arange(3 * n).reshape(n, 3))
+
+
 def a_frame(seed: int, suns: DirectionalLights = SUNS, n_lights: int = 3) -> FrameInputs:
-    camera = a_camera()
-    samples = layered_samples(camera, seed)
-    casters = soup(camera, np.random.default_rng(seed))
-    return FrameInputs(samples, nearby_lights(samples, 37, seed), ShadowScene(casters, suns, n_lights))
+    samples = layered_samples(a_camera(), seed)
+    lights = nearby_lights(samples, 37, seed)
+    return FrameInputs(samples, lights, ShadowScene(between(samples, lights, seed), suns, n_lights))
 
 
 def reference_of(inputs: FrameInputs, lights, technique: str = "brute_force") -> np.ndarray:
@@ -145,7 +157,7 @@ def test_without_geometry_or_lights_shadows_are_refused():
     lights = nearby_lights(samples, 3, 1)
     with pytest.raises(InputError, match="need the triangles of a scene"):
         render(configuration("ptsv"), FrameInputs(samples, lights))
-    casters = soup(samples.camera, np.random.default_rng(0))
+    casters = between(samples, lights, 0)
     with pytest.raises(InputError, match="--shadow-lights 31: with 2 directional lights must be from 0 to 30"):
         ShadowScene(casters, SUNS, 31)
     with pytest.raises(InputError, match="no light casts a shadow"):
