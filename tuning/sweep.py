@@ -34,7 +34,7 @@ TOO_SLOW = 4
 """A technique whose default takes this many times as long as the fastest one's is measured at its default only."""
 
 PATIENCE = 6
-"""So many choices in a row that gained nothing end the search: on a noisy machine no model is sure of that by itself."""
+"""So many choices in a row that gained nothing end the search: no model is sure of that on a noisy machine."""
 
 _ACCURACY_SHARE = 0.2  # of the budget, kept for the chart of speed against error
 
@@ -312,10 +312,10 @@ class _Run:
     def fruitless(self, space: Space, design: Collection[Configuration]) -> int:
         """How many choices of the search were measured since the fastest configuration was. By the record's order, so
         that a run that goes on stops where one run would have."""
-        fastest = self.fastest(c for c in self.measured if c in space and is_exact(c))
+        fastest = self.fastest(c for c in self.measured if c in space and c.is_exact)
         since = list(self.measured)
         since = since[since.index(fastest) + 1 :] if fastest is not None else since
-        return sum(c in space and is_exact(c) and c not in design for c in since)
+        return sum(c in space and c.is_exact and c not in design for c in since)
 
     def best(self, space: Space, max_error: float | None) -> Configuration:
         """The fastest that may be recommended."""

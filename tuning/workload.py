@@ -33,7 +33,6 @@ from vtfs.frame import (
     frame_program,
     image_on_host,
     is_listed,
-    narrowed,
     planned,
     run_stages,
     stage_program,
@@ -230,7 +229,7 @@ class SceneWorkload:
             frames.append(repeats_ms(self._frame_run(config, i), decided, hopeless_ms=HOPELESS * beat_ms))
             slowest_low = max(slowest_low, min(frames[-1]))
         # Models of stages are fitted to exact settings.
-        if all(frames) and is_listed(config) and is_exact(config):
+        if all(frames) and is_listed(config) and config.is_exact:
             env = env or run_stages(config, self._inputs[0], sizes)[0]
         taken.stages_ms = self._stages_ms(config, sizes, env) | {"frame": tuple(frames)}
         return "timed", ""
@@ -255,7 +254,7 @@ class SceneWorkload:
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:
-            program = stage_program(stage, narrowed(stage, planned(config, sizes)))
+            program = stage_program(stage, stage.narrowed(planned(config, sizes)))
             arguments = [env[name] for name in stage.needs]
 
             def run(program: Callable = program, arguments: list = arguments) -> None:

@@ -15,7 +15,7 @@ from tuning.record import read_measurements
 from tuning.space import Space, default_space
 from tuning.sweep import PATIENCE, Budget, Progress, Workload, search
 from vtfs.input_error import InputError
-from vtfs.parameters import Configuration, configuration, is_exact
+from vtfs.parameters import Configuration, configuration
 
 FRAMES = (40, 11, 3)
 _WORK = (1.6, 1.0, 0.5)  # of the three frames
@@ -202,7 +202,7 @@ def test_choices_that_gain_nothing_end_a_search_that_is_never_sure(tmp_path):
     assert result.stop_reason == f"the last {PATIENCE} choices gained nothing"
     assert of(result.best) == configuration("tiled_deferred")
     design = initial_design(WHOLE, workload.counts)
-    chosen = [c for c in workload.measured if c not in design and is_exact(c)]
+    chosen = [c for c in workload.measured if c not in design and c.is_exact]
     assert len(chosen) in (PATIENCE, PATIENCE + 1)  # the last choice may be of two
     again = Synthetic({}, hidden=workload.hidden)
     assert search(WHOLE, again, path, Budget(measurements=60)).stop_reason == result.stop_reason
