@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
-from vtfs.bit_lists import last_not_above, n_bits_set
+from vtfs.bit_lists import n_bits_set
 from vtfs.input_error import InputError
 from vtfs.node_lists import NodeLists, grouped, one_list, pairs_of
 from vtfs.shadow_mask import ShadowPlan
@@ -79,7 +79,7 @@ def walk_volumes(volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> Wal
         """A batch down to a level; `shadowed` by earlier ones."""
         own = jnp.append(jax.lax.dynamic_slice_in_dim(triangle, i * size, size), n_triangles)
         root = one_list(jax.lax.dynamic_slice_in_dim(casts, i * size, size), LANES, size)
-        root = NodeLists(own[root.triangle], root.start, root.count)
+        root = NodeLists(own[root.triangle], root.start, root.count, root.node)
         before = shadowed if plan.feedback else jnp.zeros_like(shadowed)
         counts = no_counts(n_levels, n_triangles)
         at = AtLevel(root, jnp.zeros(1, bool), jnp.zeros(1, jnp.int32), before, counts)
@@ -174,10 +174,8 @@ def _with_samples(walk: Walk, at: AtLevel, volume: Volumes, hierarchy: Hierarchy
     tested = hierarchy.n_in_tile - done
     known = bits_of_samples(walk.shadowed, hierarchy) & plan.feedback
     own_length = length[jnp.clip(hierarchy.item_of_sample, 0, n_items - 1)]
-    n_groups = at.lists.triangle.shape[0]
-    group = jnp.arange(n_groups, dtype=jnp.int32)
-    item = jnp.minimum(last_not_above(at.lists.start, group), n_items - 1)
-    each = jnp.where(group < at.lists.n_groups, tested[item], 0)
+    is_used = jnp.arange(at.lists.triangle.shape[0], dtype=jnp.int32) < at.lists.n_groups
+    each = jnp.where(is_used, tested[jnp.minimum(at.lists.nodes(), n_items - 1)], 0)
     of_triangle = at.counts.of_triangle.at[at.lists.triangle].add(each[:, None])
     counts = eqx.tree_at(lambda counts: counts.of_triangle, at.counts, of_triangle)
     length64 = length.astype(jnp.int64)
