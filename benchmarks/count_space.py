@@ -44,8 +44,8 @@ def main() -> None:
     wall_s, cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
     pairs = [row.counts["light_cluster_pairs"] for row in rows]
     print(
-        f"{device_name()}: {len(rows)} configurations in {wall_s:.1f} s ({cpu_s:.1f} s of CPU time), {compiled.programs} programs compiled in "
-        f"{compiled.seconds:.1f} s; {min(pairs):,} to {max(pairs):,} pairs"
+        f"{device_name()}: {len(rows)} configurations in {wall_s:.1f} s ({cpu_s:.1f} s of CPU time), "
+        f"{compiled.programs} programs compiled in {compiled.seconds:.1f} s; {min(pairs):,} to {max(pairs):,} pairs"
     )
 
 
