@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from tuning.budget import Budget
 from tuning.choose import Objective, is_timed, median_interval, time_interval_ms, time_ms
 from tuning.compiles import watch_compiles
 from tuning.measurement import Measurement
+from tuning.search_run import Progress
 from tuning.space import Space, default_space
-from tuning.sweep import Budget, Progress, SearchResult, search
+from tuning.sweep import SearchResult, search
 from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_counts
 from vtfs.device import versions
 from vtfs.files import write_atomically

@@ -80,7 +80,7 @@ class ScenePath:
 
 
 class SceneWorkload:
-    """Counts and measures configurations on a few frames. Implements `sweep.Workload`."""
+    """Counts and measures configurations on a few frames. Implements `search_run.Workload`."""
 
     def __init__(self, path: ScenePath, compiles: Compiles, objective: Objective = "max"):
         self._path = path

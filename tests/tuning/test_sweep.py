@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import tuning.sweep
+from tuning.budget import Budget
 from tuning.choose import choose_next, initial_design
 from tuning.measurement import Measurement, Outcome
 from tuning.record import read_measurements
+from tuning.search_run import Progress, Workload
 from tuning.space import Space, default_space
-from tuning.sweep import PATIENCE, Budget, Progress, Workload, search
+from tuning.sweep import PATIENCE, search
 from vtfs.input_error import InputError
 from vtfs.parameters import Configuration, configuration, is_exact
 

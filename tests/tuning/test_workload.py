@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 
 import tuning.timing
 from tests.command_line import short_repeats
+from tuning.budget import Budget
 from tuning.choose import Objective, is_timed, time_ms
 from tuning.compiles import Compiles
 from tuning.space import Space, load_space
-from tuning.sweep import Budget, search
+from tuning.sweep import search
 from tuning.tune import choose_frames
 from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_counts
 from vtfs.camera import Viewport

@@ -70,8 +70,8 @@ def tune(
                 raise InputError(f"{name}: goes without --measurements, which measures nothing; leave one of them out.")
         recommend_imported(measurements, scene, names if techniques else None, objective, out, json_file)
         return
+    from tuning.budget import Budget
     from tuning.space import load_space
-    from tuning.sweep import Budget
     from vtfs.device import keep_compiled_programs
 
     budget_parsed = Budget.parse(budget) if budget is not None else None
