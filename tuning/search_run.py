@@ -16,7 +16,7 @@ from tuning.record import append_measurement, read_measurements
 from tuning.select import fit_stage
 from tuning.space import Space
 from vtfs.input_error import InputError
-from vtfs.parameters import Configuration, configuration, exact_configuration, is_exact
+from vtfs.parameters import Configuration, configuration
 
 
 class Workload(Protocol):
@@ -136,9 +136,9 @@ class SearchRun:
     def _is_allowed(self, candidate: Configuration) -> bool:
         """May it be recommended? What may not, as a default that the space leaves out, is not there to be beaten."""
         if self._max_error is None:
-            return candidate in self._space and is_exact(candidate)
+            return candidate in self._space and candidate.is_exact
         error = self.measured[candidate].error
-        known = candidate in self._space or exact_configuration(candidate) in self._space
+        known = candidate in self._space or candidate.exact() in self._space
         return known and error is not None and error <= self._max_error
 
     def timed(self, candidate: Configuration) -> Measurement | None:
@@ -152,18 +152,14 @@ class SearchRun:
     def fruitless(self, space: Space, design: Collection[Configuration]) -> int:
         """How many choices of the search were measured since the fastest configuration was. By the record's order, so
         that a run that goes on stops where one run would have."""
-        fastest = self.fastest(c for c in self.measured if c in space and is_exact(c))
+        fastest = self.fastest(c for c in self.measured if c in space and c.is_exact)
         since = list(self.measured)
         since = since[since.index(fastest) + 1 :] if fastest is not None else since
-        return sum(c in space and is_exact(c) and c not in design for c in since)
+        return sum(c in space and c.is_exact and c not in design for c in since)
 
     def best(self, space: Space, max_error: float | None) -> Configuration:
         """The fastest that may be recommended."""
-        timed = {
-            c: m
-            for c in self.measured
-            if (c in space or exact_configuration(c) in space) and (m := self.timed(c)) is not None
-        }
+        timed = {c: m for c in self.measured if (c in space or c.exact() in space) and (m := self.timed(c)) is not None}
         if not timed:
             outcomes = ", ".join(sorted({measurement.outcome for measurement in self.measured.values()}))
             message = next((f": {m.message}" for m in self.measured.values() if m.message), "")
@@ -172,7 +168,7 @@ class SearchRun:
                 "try a smaller size, a larger budget, other techniques or another space."
             )
         if max_error is None:
-            found = self.fastest(filter(is_exact, timed))
+            found = self.fastest(c for c in timed if c.is_exact)
             if found is None:
                 raise InputError("max-error is missing and no exact setting could be timed; say what error is allowed.")
             return found

@@ -22,7 +22,7 @@ from tuning.measurement import Measurement
 from tuning.search_run import Progress, SearchRun, Workload
 from tuning.select import fit_models
 from tuning.space import Space, accuracy_values
-from vtfs.parameters import Configuration, configuration, is_exact
+from vtfs.parameters import Configuration, configuration
 
 HOPELESS = 12
 """A technique whose default needs this many times the lighting computations of the thriftiest is not measured."""
@@ -31,7 +31,7 @@ TOO_SLOW = 4
 """A technique whose default takes this many times as long as the fastest one's is measured at its default only."""
 
 PATIENCE = 6
-"""So many choices in a row that gained nothing end the search: on a noisy machine no model is ever sure."""
+"""So many choices in a row that gained nothing end the search: no model is sure of that on a noisy machine."""
 
 _ACCURACY_SHARE = 0.2  # of the budget, kept for the chart of speed against error
 
@@ -123,7 +123,7 @@ def search(
             break
         in_budget = all(run.measure(candidate, share) for candidate in choice.configurations)
 
-    exact = run.fastest(candidate for candidate in run.measured if candidate in hopeful and is_exact(candidate))
+    exact = run.fastest(candidate for candidate in run.measured if candidate in hopeful and candidate.is_exact)
     if exact is not None:
         for candidate in _less_accurate(exact):
             if not run.measure(candidate):
@@ -182,8 +182,7 @@ def _explored(space: Space, run: SearchRun) -> tuple[Space, dict[str, str]]:
 
 
 def _less_accurate(exact: Configuration) -> list[Configuration]:
-    settings = ({"gbuffer": gbuffer, "light_cutoff": cutoff} for gbuffer, cutoff in accuracy_values())
-    changed = [{k: v for k, v in setting.items() if k in exact.params} for setting in settings]
+    changed = [{k: v for k, v in setting.items() if k in exact.params} for setting in accuracy_values()]
     return [c for c in dict.fromkeys(exact.replaced(**change) for change in changed) if c != exact]
 
 

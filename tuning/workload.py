@@ -20,6 +20,7 @@ from tuning.measurement import Measurement, Outcome
 from tuning.shadow_check import MaskCheck, ShadowChecker, masks_on_host
 from tuning.timing import interleaved_ms, repeats_ms, timed_ms
 from vtfs.cache import cached
+from vtfs.cell_maps import CellMaps, cell_maps
 from vtfs.device import device_name, versions
 from vtfs.frame import (
     NO_SIZES,
@@ -32,15 +33,14 @@ from vtfs.frame import (
     frame_program,
     image_on_host,
     is_listed,
-    narrowed,
     planned,
     run_stages,
     stage_program,
 )
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
-from vtfs.op_counts import OpCounts
-from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration, is_exact
+from vtfs.op_counts import ListLengths, OpCounts
+from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration
 from vtfs.reference import forward_reference, image_error
 from vtfs.shadow_inputs import ShadowScene
 from vtfs.techniques import REGISTRY
@@ -86,7 +86,10 @@ class SceneWorkload:
         self._path = path
         self._compiles = compiles
         self._objective = objective
-        self._inputs = [FrameInputs(samples, path.lights, path.shadow_scene) for samples in path.samples]
+        self._inputs = [
+            FrameInputs(samples, path.lights, frame, shadow_scene=path.shadow_scene)
+            for samples, frame in zip(path.samples, path.frames, strict=True)
+        ]
         self._reference: np.ndarray | None = None
         self._checker: ShadowChecker | None = None
         self._counted: dict[tuple[Configuration, int], FrameCounts] = {}
@@ -158,9 +161,17 @@ class SceneWorkload:
         """Which pixels of that frame have a sample."""
         return self._inputs[0].seen()
 
-    def list_lengths(self, config: Configuration) -> np.ndarray:
-        """Lights listed for each pixel of that frame."""
-        return count(config, self._inputs[0])[1].of_sample
+    def solid(self) -> np.ndarray:
+        """Which of them have a solid one."""
+        return self._inputs[0].samples.valid
+
+    def list_lengths(self, config: Configuration) -> ListLengths:
+        """Lights listed for each pixel and each cell of that frame."""
+        return count(config, self._inputs[0])[1]
+
+    def cell_maps(self, config: Configuration) -> CellMaps | None:
+        """The cells of that frame; None where the technique has none."""
+        return cell_maps(config, self._inputs[0])
 
     def reference(self) -> np.ndarray:
         """The float64 image of the frame with the most work, without shadows."""
@@ -195,7 +206,7 @@ class SceneWorkload:
             reference = self.reference()
         with np.errstate(invalid="ignore", over="ignore"):  # of an image that overflowed the error is infinite
             taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), reference, valid)
-        if is_exact(config) and not taken.error <= EXACT_ERROR:
+        if config.is_exact and not taken.error <= EXACT_ERROR:
             return "failed", f"error {taken.error:.2g} against the float64 reference; float32 explains {EXACT_ERROR:g}"
         # The first run's time may be the compiler's: only a second one is held against the configuration.
         slow = time.perf_counter() - started > TIMEOUT_S
@@ -218,7 +229,7 @@ class SceneWorkload:
             frames.append(repeats_ms(self._frame_run(config, i), decided, hopeless_ms=HOPELESS * beat_ms))
             slowest_low = max(slowest_low, min(frames[-1]))
         # Models of stages are fitted to exact settings.
-        if all(frames) and is_listed(config) and is_exact(config):
+        if all(frames) and is_listed(config) and config.is_exact:
             env = env or run_stages(config, self._inputs[0], sizes)[0]
         taken.stages_ms = self._stages_ms(config, sizes, env) | {"frame": tuple(frames)}
         return "timed", ""
@@ -238,11 +249,12 @@ class SceneWorkload:
 
         None where `env` is empty: of what has lost, and where the frame is one stage.
         """
-        stages = REGISTRY[config.technique].stages_of(self._inputs[0].has_transparent) if env else ()
+        technique = REGISTRY[config.technique]
+        stages = technique.stages_of(technique.plan(config), self._inputs[0].has_transparent) if env else ()
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:
-            program = stage_program(stage, narrowed(stage, planned(config, sizes)))
+            program = stage_program(stage, stage.narrowed(planned(config, sizes)))
             arguments = [env[name] for name in stage.needs]
 
             def run(program: Callable = program, arguments: list = arguments) -> None:
