@@ -10,7 +10,7 @@ from vtfs.input_error import InputError
 
 @dataclass(frozen=True)
 class Budget:
-    """How much may be measured: a number of configurations, or seconds spent in `Workload.measure`."""
+    """How much may be measured: a number of configurations, or seconds in `Workload.measure` but for compiling."""
 
     measurements: int | None = None
     seconds: float | None = None

@@ -92,8 +92,7 @@ class SearchRun:
         except InputError:  # of a version with other techniques or parameters
             return
         self.measured.setdefault(candidate, measurement)
-        repeats_ms = (ms for frames in measurement.stages_ms.values() for repeats in frames for ms in repeats)
-        self._seconds += sum(s for s in (measurement.compile_s, *(ms / 1e3 for ms in repeats_ms)) if math.isfinite(s))
+        self._seconds += _repeats_s(measurement)
 
     @property
     def spent(self) -> float:
@@ -129,7 +128,9 @@ class SearchRun:
     def _record(self, candidate: Configuration, best_ms: float | None) -> None:
         started = self._clock()
         measurement = self._workload.measure(candidate, best_ms)
-        self._seconds += self._clock() - started
+        # Without compiling, so that a cold cache does not end the search early. Two programs may compile at once.
+        elapsed_s = self._clock() - started
+        self._seconds += max(elapsed_s - measurement.compile_s, _repeats_s(measurement))
         append_measurement(self._record_path, measurement)
         self.measured[candidate] = measurement
 
@@ -202,3 +203,8 @@ class SearchRun:
             if model is not None:
                 models[technique] = model
         return models
+
+
+def _repeats_s(measurement: Measurement) -> float:
+    times_ms = (ms for frames in measurement.stages_ms.values() for repeats in frames for ms in repeats)
+    return sum(ms for ms in times_ms if math.isfinite(ms)) / 1e3

@@ -86,8 +86,8 @@ def search(
     """Find the fastest configuration with few measurements; every one is appended to `record_path` at once.
 
     What `record_path` already holds of the same scene, device and frames is not measured again and counts
-    against the budget: as measurements, or as the seconds of its repeats and its compiling (its sizing runs are
-    not known any more). The configuration being measured when the budget is used up is completed.
+    against the budget: as measurements, or as the seconds of its repeats (its sizing runs are not known any more).
+    The configuration being measured when the budget is used up is completed.
 
     A fifth of the budget is kept for the settings that trade accuracy for speed, tried at the best exact
     configuration.

@@ -27,7 +27,8 @@ from vtfs.frame import FrameInputs
 from vtfs.parameters import Configuration, configuration
 from vtfs.scene_setup import SceneSetup
 
-DEFAULT_BUDGET = Budget(seconds=90.0)
+DEFAULT_BUDGET = Budget(seconds=40.0)
+"""On two CPU cores a frame costs half a second: a dozen configurations, and a minute for the whole command."""
 DEFAULT_CONFIGURATION = configuration("tiled_deferred")
 
 CLAIM = "for this JAX implementation on this device; nothing is rasterised: frame times start at view samples"

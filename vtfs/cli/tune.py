@@ -30,7 +30,7 @@ def tune(
     ] = None,
     space: Annotated[Path | None, typer.Option(help="Search space as TOML.", metavar="FILE")] = None,
     budget: Annotated[
-        str | None, typer.Option(help="Measurements, as 40, or seconds of measuring, as 120s.", show_default="90s")
+        str | None, typer.Option(help="Measurements, as 40, or seconds of measuring, as 120s.", show_default="40s")
     ] = None,
     objective: Annotated[
         str, typer.Option(help="`max`: the slowest frame decides; `mean`: the mean of the frames.")
