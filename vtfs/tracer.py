@@ -49,14 +49,15 @@ class Tracer:
         seen = np.full((camera.viewport.height_px, camera.viewport.width_px), -1, np.int32)
 
         def trace(rows: slice) -> None:
-            rays = _Rays(camera, rows)
+            rays = _Rays(camera, rows, self._centre_m)
             band = seen[rows].reshape(-1)
-            first, _ = self._first_hits(self._solid, *rays.at(camera.near_m))
+            first, _ = self._solid.first_hits(*rays.at(camera.near_m))
             masked = np.flatnonzero((first >= 0) & self._is_masked[first])
             band[...] = first
             band[masked] = -1
             # Rays that met an alpha-tested surface go on until one passes its test.
-            for ray, triangle, _ in self._march(self._solid, found, rays, masked, np.inf, only_first=True):
+            hits = self._march(self._solid, found, rays, masked, np.inf, only_first=True, hit=first[masked])
+            for ray, triangle, _ in hits:
                 band[ray] = triangle
 
         by_bands(camera, trace)
@@ -77,7 +78,7 @@ class Tracer:
         found: dict[int, list[tuple[np.ndarray, ...]]] = {}
 
         def trace(rows: slice) -> None:
-            rays = _Rays(camera, rows)
+            rays = _Rays(camera, rows, self._centre_m)
             first_pixel = rows.start * camera.viewport.width_px
             scene = self._blended if blended else self._solid
             ends_m = until_m[rows].reshape(-1)
@@ -98,12 +99,9 @@ class Tracer:
 
         **Returns:** int32 triangle indices, -1 for none, and float32 parameters along the rays.
         """
-        return self._first_hits(self._solid, origin_m, direction)
-
-    def _first_hits(
-        self, scene: _EmbreeScene, origin_m: np.ndarray, direction: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return scene.first_hits(origin_m - self._centre_m, direction)
+        return self._solid.first_hits(
+            np.ascontiguousarray(origin_m - self._centre_m, np.float32), np.ascontiguousarray(direction, np.float32)
+        )
 
     def _march(
         self,
@@ -113,6 +111,7 @@ class Tracer:
         ray: np.ndarray,
         until_m: np.ndarray | float,
         only_first: bool,
+        hit: np.ndarray | None = None,
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Steps of rays from surface to surface: ray, triangle and depth of those that pass their alpha test.
 
@@ -121,6 +120,7 @@ class Tracer:
         - `ray`: which of `rays` to follow.
         - `until_m`: depth at which they end, of all or `[len(rays)]`.
         - `only_first`: a ray ends at the first surface that passes.
+        - `hit`: the triangles that the rays meet first, if the caller has them already.
         """
         ends_m = np.broadcast_to(until_m, len(rays.x))
         # The first step past a surface: some float32 roundings of the coordinates that Embree sees.
@@ -128,7 +128,8 @@ class Tracer:
         past_m, step_m = np.full(len(ray), rays.near_m), np.full(len(ray), resolution_m)
         last = np.full(len(ray), -1, np.int32)
         for _ in range(_LARGEST_LAYERS):
-            hit, _ = self._first_hits(scene, *rays.at(past_m, ray))
+            if hit is None:
+                hit, _ = scene.first_hits(*rays.at(past_m, ray))
             on = np.flatnonzero(hit >= 0)
             ray, past_m, step_m, last, hit = (values[on] for values in (ray, past_m, step_m, last, hit))
             if len(ray) == 0:
@@ -143,6 +144,7 @@ class Tracer:
             past_m = np.maximum(np.where(is_again, past_m, depth_m), past_m) + step_m
             on = np.flatnonzero(~is_over & ~is_there if only_first else ~is_over)
             ray, past_m, step_m, last = (values[on] for values in (ray, past_m, step_m, hit))
+            hit = None
         log.warning("%d rays met more than %d surfaces; the others are not seen", len(ray), _LARGEST_LAYERS)
 
 
@@ -161,11 +163,10 @@ class _EmbreeScene:
             self._embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # the first query builds it
 
     def first_hits(self, origin_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Triangle and parameter of the first hit of each ray; float32 `[N, 3]`, C-contiguous."""
         if self.is_empty or len(origin_m) == 0:
             return np.full(len(origin_m), -1, np.int32), np.full(len(origin_m), np.inf, np.float32)
-        hits = self._embree.run(
-            np.ascontiguousarray(origin_m, np.float32), np.ascontiguousarray(direction, np.float32), output=True
-        )
+        hits = self._embree.run(origin_m, direction, output=True)
         primitive = hits["primID"]
         return np.where(primitive >= 0, self._triangle_of[primitive], -1), hits["tfar"]
 
@@ -176,21 +177,26 @@ class _Rays:
     In a parallel projection slopes are where rays start, and all have one direction.
     """
 
-    def __init__(self, camera: Camera, rows: slice):
+    def __init__(self, camera: Camera, rows: slice, centre_m: np.ndarray):
         self.near_m = camera.near_m
         self.x, self.y = pixel_rays(camera, rows)
         self._right, self._up, self._backward = camera.view_from_world[:3, :3]
         self._eye_m = np.asarray(camera.eye_m, np.float64)
+        self._centre_m = centre_m
         self._is_parallel = camera.is_orthographic
 
     def at(self, depth_m: np.ndarray | float, ray: np.ndarray | slice = np.s_[:]) -> tuple[np.ndarray, np.ndarray]:
-        """World-space points at a depth on some rays, and the rays' directions: float64 `[N, 3]`."""
-        aside, depth_m = self.x[ray, None] * self._right + self.y[ray, None] * self._up, np.reshape(depth_m, (-1, 1))
-        if self._is_parallel:
-            direction = np.broadcast_to(-self._backward, aside.shape)
-            return self._eye_m + aside + depth_m * direction, direction
-        direction = aside - self._backward
-        return self._eye_m + depth_m * direction, direction
+        """Points at a depth on some rays, relative to the centre, and the rays' directions: float32 `[N, 3]`, world
+        axes. Float64 until then."""
+        x, y = self.x[ray], self.y[ray]
+        origin_m, direction = np.empty((2, len(x), 3), np.float32)
+        for k in range(3):  # a column at a time: NumPy is slow on rows of three
+            aside = x * self._right[k] + y * self._up[k]
+            along = -self._backward[k] if self._is_parallel else aside - self._backward[k]
+            start_m = self._eye_m[k] + aside if self._is_parallel else self._eye_m[k]
+            direction[:, k] = along
+            origin_m[:, k] = start_m + depth_m * along - self._centre_m[k]
+        return origin_m, direction
 
 
 class Planes:
@@ -277,8 +283,10 @@ def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         row = np.nan_to_num(v - np.floor(v), posinf=0, neginf=0) * height - 0.5
     left, above = np.floor(column).astype(np.int32), np.floor(row).astype(np.int32)
     s, t = column - left, row - above
-    left, above = left % width, above % height
-    right, below = (left + 1) % width, (above + 1) % height
+    # Within one of the image: remainders of integers are slow.
+    right, below = left + 1, above + 1
+    left[left < 0], above[above < 0] = width - 1, height - 1
+    right[right >= width], below[below >= height] = 0, 0
     texels = image.ravel()
     upper = texels[above * width + left] * (1 - s) + texels[above * width + right] * s
     lower = texels[below * width + left] * (1 - s) + texels[below * width + right] * s
