@@ -110,13 +110,21 @@ def test_lights_taken_off_vary_by_no_more_than_allowed(technique, share):
     corners = np.array([np.asarray(c, np.float64) for c in jax.tree.leaves(box)])
     view_m = oracles.in_view_space(samples.camera, lights.position_m)
     rotation = samples.camera.view_from_world[:3, :3]
-    irradiance = np.stack([np.asarray(c, np.float64) for c in env["cluster_light"].irradiance], -1)
+    irradiance, highlight = (
+        np.stack([np.asarray(c, np.float64) for c in part], -1)
+        for part in (env["cluster_light"].irradiance, env["cluster_light"].highlight)
+    )
     for c in range(int(env["clusters"].n_clusters)):
         here = samples.valid & (cluster == c)
         centre_m = (corners[:3, c] + corners[3:, c])[None] / 2
         axis = np.array([[float(np.asarray(a)[c]) for a in (cones.x, cones.y, cones.z)]])
         at_centre = lit(centre_m, axis, lights, view_m, rotation)[0]
         assert np.allclose(irradiance[c], (taken[c] * at_centre) @ lights.colour, rtol=1e-4, atol=1e-6)
+        to_light, to_eye = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (view_m - centre_m, -centre_m))
+        half = to_light + to_eye
+        n_dot_h = np.maximum((half @ axis[0]) / np.linalg.norm(half, axis=1), 0)
+        gloss = taken[c] * at_centre * n_dot_h ** float(samples.shininess[here].mean())
+        assert np.allclose(highlight[c], gloss @ lights.colour, rtol=1e-3, atol=1e-6)  # powers of up to 64
         brightness = lights.colour.sum(axis=1)
         most = share * (listed[c] * at_centre) @ brightness
         at_samples = lit(samples.position_m[here].astype(np.float64), samples.normal[here], lights, view_m, rotation)
