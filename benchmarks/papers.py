@@ -35,7 +35,6 @@ from vtfs.frame import (
     FrameInputs,
     count,
     frame_program,
-    narrowed,
     planned,
     run_stages,
     stage_program,
@@ -120,7 +119,7 @@ def lists_ms(technique: str, params: dict[str, object], inputs: FrameInputs) -> 
     plan, total = planned(config, sizes), 0.0
     for stage in REGISTRY[technique].stages_of(plan, inputs.has_transparent):
         if stage.name in ("reduce", "morton", "sort", "build_tree", "assign"):
-            program = stage_program(stage, narrowed(stage, plan))
+            program = stage_program(stage, stage.narrowed(plan))
             total += median_ms(lambda program=program, stage=stage: program(*(env[name] for name in stage.needs)))
     return total
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from vtfs.directional_lights import DirectionalLights
 from vtfs.gbuffer import Fragments, to_runs
 from vtfs.input_error import InputError
+from vtfs.layers import Layers
 from vtfs.light_shadows import MAX_SHADOW_LIGHTS, CastMask, ShadowSlots
 from vtfs.lights import Lights
 from vtfs.parameters import Configuration
@@ -163,7 +164,8 @@ class FrameShadows:
 
     @cached_property
     def _on_device(self) -> tuple:
-        fragments = [Fragments(view, with_hidden=False) for view in self.views]
+        alone = [replace(view, layers=Layers()) for view in self.views]
+        fragments = [Fragments(view, with_hidden=False) for view in alone]
         positions = [own.positions() for own in fragments]
         return tuple((own, part.gbuffer(own, "float32").normal) for part, own in zip(fragments, positions, strict=True))
 
@@ -187,7 +189,7 @@ class FrameShadows:
         for view in self.views:
             for k in range(len(self.lights)):
                 mask = self.reference(view, k, config.technique, front_faces)
-                masks.append((jax.device_put(to_runs(mask)), np.bool_(False)))
+                masks.append(CastMask(jax.device_put(to_runs(mask)), jax.device_put(np.bool_(False))))
         return masks
 
     def lit_by(self, view: ViewSamples, k: int) -> np.ndarray:
