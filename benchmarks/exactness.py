@@ -188,9 +188,10 @@ def configured(case: tuple[str, dict[str, Value]], grid: dict[str, Value]) -> Co
     return configuration(technique, {**params, **grid})
 
 
-def campaign(n_scenes: int, first: int) -> None:
+def campaign(n_scenes: int, first: int, seconds: float) -> None:
+    """All scenes, or as many as the time allows."""
     tallies: dict[str, Tally] = defaultdict(Tally)
-    began = time.perf_counter()
+    began, n_done = time.perf_counter(), 0
     for seed in range(first, first + n_scenes):
         samples, lights = draw_scene(seed)
         inputs, reaches = FrameInputs(samples, lights), reaching(samples, lights)
@@ -208,7 +209,10 @@ def campaign(n_scenes: int, first: int) -> None:
             print(
                 f"<!-- {seed + 1 - first} scenes, {time.perf_counter() - began:.0f} s, {missed} missed -->", flush=True
             )
-    report(f"{n_scenes:,} random scenes", tallies)
+        n_done = seed + 1 - first
+        if time.perf_counter() - began > seconds:
+            break
+    report(f"{n_done:,} random scenes from {first}", tallies)
 
 
 def report(title: str, tallies: dict[str, Tally]) -> None:
@@ -342,11 +346,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=10_000)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="end the campaign after so long")
     parser.add_argument("--only", default="campaign,pitfalls,frustum")
     asked = parser.parse_args()
     for name in asked.only.split(","):
         if name == "campaign":
-            campaign(asked.scenes, asked.first)
+            campaign(asked.scenes, asked.first, asked.seconds)
         else:
             {"pitfalls": pitfalls, "frustum": frustum}[name]()
 
