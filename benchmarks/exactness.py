@@ -15,6 +15,7 @@ import itertools
 import math
 import time
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -149,7 +150,8 @@ def listed_at(config: Configuration, inputs: FrameInputs) -> tuple[np.ndarray, i
         total = int(lists.total)
         light, run, mask = (np.asarray(c)[:total] for c in (lists.light, lists.run, lists.mask))
         covered = np.zeros((len(np.asarray(env["positions"].place)), 32, inputs.n_lights), bool)
-        np.logical_or.at(covered, (run, slice(None), light), (mask[:, None] >> np.arange(32, dtype=np.uint32)) & 1 == 1)
+        # A light has a run once, so that no place is written twice.
+        covered[run, :, light] = (mask[:, None] >> np.arange(32, dtype=np.uint32)) & 1 == 1
         rows, columns = np.moveaxis(oracles.run_pixels(inputs.viewport), -1, 0)
         inside = (rows < inputs.viewport.height_px) & (columns < inputs.viewport.width_px)
         at = np.zeros((*samples.valid.shape, inputs.n_lights), bool)
@@ -179,7 +181,7 @@ def check(
         print(f"MISSED {missed.sum()}: {name}, {config}: valid sample {sample}, light {light}", flush=True)
 
 
-def configured(case: tuple[str, dict[str, Value]], grid: dict[str, Value]) -> Configuration:
+def configured(case: tuple[str, dict[str, Value]], grid: Mapping[str, Value]) -> Configuration:
     technique, params = case
     if "deferred_stencil" in technique or technique == "deferred":
         return configuration(technique, params)
