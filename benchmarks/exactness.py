@@ -11,6 +11,7 @@ matter. Scenes and lights are those of the tests, adversarial ones; with other s
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import math
 import time
@@ -152,18 +153,26 @@ def listed_at(config: Configuration, inputs: FrameInputs) -> tuple[np.ndarray, i
         covered = np.zeros((len(np.asarray(env["positions"].place)), 32, inputs.n_lights), bool)
         # A light has a run once, so that no place is written twice.
         covered[run, :, light] = (mask[:, None] >> np.arange(32, dtype=np.uint32)) & 1 == 1
-        rows, columns = np.moveaxis(oracles.run_pixels(inputs.viewport), -1, 0)
-        inside = (rows < inputs.viewport.height_px) & (columns < inputs.viewport.width_px)
-        at = np.zeros((*samples.valid.shape, inputs.n_lights), bool)
-        at[rows[inside], columns[inside]] = covered[: len(rows)][inside]
-        return at[samples.valid], total
+        return as_image(covered, inputs.viewport)[samples.valid], total
     clusters = env["clusters"]
     count, index = np.asarray(lists.count), np.asarray(lists.index)
     table = np.zeros((len(count), inputs.n_lights), bool)
     table[np.repeat(np.arange(len(count)), count), index[: int(lists.total)]] = True
     cluster = np.asarray(clusters.block_cluster)[np.asarray(clusters.block_of_sample)]
     n_visible = env["positions"].n_visible_runs
-    return table[oracles.as_image(cluster[:n_visible], inputs.viewport)[samples.valid]], int(lists.total)
+    return table[as_image(cluster[:n_visible], inputs.viewport)[samples.valid]], int(lists.total)
+
+
+run_pixels = functools.cache(oracles.run_pixels)  # a loop over pixels
+
+
+def as_image(runs: np.ndarray, viewport: Viewport) -> np.ndarray:
+    """`[runs, 32, ...]` to `[h, w, ...]`."""
+    rows, columns = np.moveaxis(run_pixels(viewport), -1, 0)
+    inside = (rows < viewport.height_px) & (columns < viewport.width_px)
+    image = np.zeros((viewport.height_px, viewport.width_px, *runs.shape[2:]), runs.dtype)
+    image[rows[inside], columns[inside]] = runs[: len(rows)][inside]
+    return image
 
 
 def check(
