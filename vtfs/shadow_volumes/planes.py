@@ -28,6 +28,9 @@ Extra = Literal["off", "vertex", "silhouette"]
 planes that meet there (Sintorn et al. 2014, Sec. 3), or those of them that also hold the eye and bound the volume on
 the screen (the silhouette edges of Sintorn et al. 2011, Sec. 4.2)."""
 
+Precision = Literal["float64", "float32"]
+"""Of the test of a sample against planes."""
+
 SMALLEST_VOLUME = 1e-10
 """A triangle is left out where its signed volume with the light is below this share of the product of edge normals and
 vertices that it is summed from: it is seen edge-on, or narrower than 1e-10 rad. Rounding (2^-52) then moves the border
@@ -35,6 +38,9 @@ of what is kept by at most 1e-5 of its size, and its orientation is certain."""
 
 BELOW_ZERO = -1e-300
 """Below zero, above every product that is not zero, and no subnormal, which some devices take for zero."""
+
+_BELOW_ZERO_32 = -2e-38
+"""The same in float32."""
 
 PAD = 16 * 2.0**-24
 """Relative error bound of a float32 plane test: under eight roundings, each 2^-24, of every product; doubled."""
@@ -162,6 +168,14 @@ def edge_planes(
         last((dot(face, corner[0]) + bias_m * volume if directional else volume) * inward, jnp.inf),
     )
     return planes, inward
+
+
+def in_precision(planes: EdgePlanes, precision: Precision) -> EdgePlanes:
+    """The planes as a test in another precision reads them: rounded, ties broken as before."""
+    if precision == "float64":
+        return planes
+    least = tuple(jnp.where(value < 0, jnp.float32(_BELOW_ZERO_32), jnp.float32(0)) for value in planes.least)
+    return eqx.tree_at(lambda p: p.least, jax.tree.map(lambda c: c.astype(jnp.float32), planes), least)
 
 
 def inside(planes: EdgePlanes, sample: Vector, moved: Float[Array, "*n"]) -> Bool[Array, "*n"]:

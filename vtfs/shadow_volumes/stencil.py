@@ -18,18 +18,20 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vtfs.bounds import Aabb
 from vtfs.gbuffer import Positions
-from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
+from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan, Stencil
 from vtfs.shadow_volumes.planes import (
     BELOW_ZERO,
     SMALLEST_VOLUME,
     EdgePlanes,
     NodePlanes,
+    Precision,
     Vector,
     corners,
     cross,
     dot,
     edge_planes,
     first_is_positive,
+    in_precision,
     inside,
     length,
     minus,
@@ -54,10 +56,45 @@ class Polygons(eqx.Module):
     crossing: Int[Array, " polygons"]
 
 
+class PolygonCounts(eqx.Module):
+    """What is drawn over each sample, whatever the stencil: `is_set` tells the shadow from it.
+
+    - `around_eye`: volumes that hold the eye. `adding`, `taking`: polygons that add to the stencil, and take from it.
+    """
+
+    around_eye: Int[Array, ""]
+    adding: Int[Array, "runs 32"]
+    taking: Int[Array, "runs 32"]
+
+
+def is_set(counts: PolygonCounts, stencil: Stencil, starts_around_eye: bool) -> Bool[Array, "runs 32"]:
+    """Is a sample's stencil not zero in the end? For arrays of JAX or NumPy.
+
+    **Arguments:**
+
+    - `starts_around_eye`: the stencil starts with the volumes around the eye; never for z-fail.
+    """
+    added = counts.around_eye * starts_around_eye + counts.adding
+    if stencil == "saturate":  # all that add are drawn first, and leave no more than the largest value
+        return (added > counts.taking) & (counts.taking < _LARGEST)
+    if stencil == "wrap":
+        return (added - counts.taking) % (_LARGEST + 1) != 0
+    return added != counts.taking
+
+
 def stencil_mask(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> ShadowMask:
     """Shadows by counting the polygons before each sample (z-pass) or behind it (z-fail).
 
     Samples are moved toward the light by the bias.
+    """
+    polygons, mask = count_polygons(frame, plan, by_failing)
+    return replace(mask, shadowed=mask.shadowed & is_set(polygons, plan.stencil, plan.around_eye and not by_failing))
+
+
+def count_polygons(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> tuple[PolygonCounts, ShadowMask]:
+    """Draw the polygons around volumes.
+
+    **Returns:** what they do to the stencil, and a mask in which all that is tested is in shadow.
     """
     origin = frame.eye_m
     vertex = rotated(frame, tuple(c - origin[k] for k, c in enumerate(frame.vertex_m)))
@@ -66,7 +103,7 @@ def stencil_mask(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> Shad
     apex = tuple(jnp.zeros(3, jnp.float64)) if frame.directional else light
     about_light = tuple(c - o for c, o in zip(vertex, apex, strict=True))
     planes, inward = edge_planes(about_light, frame.triangles, light, frame.directional, zero, frame.culls_front)
-    polygons = _polygons(frame, vertex, light, apex, inward, by_failing)
+    drawn = _polygons(frame, vertex, light, apex, inward, by_failing)
     around_eye = jnp.sum(inside(planes, tuple(-o for o in apex), zero), dtype=jnp.int32)
 
     samples = sample_tiles(_moved(frame, light), frame.receives, plan.tile_px)
@@ -76,19 +113,12 @@ def stencil_mask(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> Shad
     plain = replace(plan, feedback=False, extra="off", batch=0)
 
     def count(crossing: Array) -> tuple[Array, Walk]:
-        volume = _seen_volumes(polygons, polygons.crossing == crossing, by_failing)
+        volume = _seen_volumes(drawn, drawn.crossing == crossing, by_failing, plan.precision)
         return count_volumes(volume, table, samples, tiles, plain)
 
     # One after the other by the same code: it is compiled once.
     (entered, left), walks = jax.lax.map(count, jnp.array([1, -1], jnp.int32))
     added, taken = (left, entered) if by_failing else (entered, left)
-    before = around_eye if plan.around_eye and not by_failing else jnp.int32(0)
-    if plan.stencil == "saturate":  # all that add are drawn first
-        is_set = jnp.maximum(jnp.minimum(before + added, _LARGEST) - taken, 0) > 0
-    elif plan.stencil == "wrap":
-        is_set = (before + added - taken) % (_LARGEST + 1) != 0
-    else:
-        is_set = before + added != taken
     n_in_tile = jnp.where(jnp.asarray(tile >= 0), jnp.sum(samples.receives, axis=1, dtype=jnp.int32)[tiles], 0)
     item_of_sample = jnp.broadcast_to(jnp.asarray(place_of)[:, None], samples.receives.shape)
     result = mask_of(
@@ -98,9 +128,10 @@ def stencil_mask(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> Shad
     )  # fmt: skip
     places = jnp.asarray(place_of)
     updates = jnp.sum(jnp.where(samples.receives, (added + taken)[places], 0), dtype=jnp.int64)
-    shadowed = in_runs(samples.receives & is_set[places], samples.viewport, samples.tile_px)
     counts = eqx.tree_at(lambda counts: counts.stencil_updates, result.counts, updates)
-    return ShadowMask(shadowed, result.overflowed, result.tests, counts)
+    view = samples.viewport, samples.tile_px
+    polygons = PolygonCounts(around_eye, in_runs(added[places], *view), in_runs(taken[places], *view))
+    return polygons, ShadowMask(in_runs(samples.receives, *view), result.overflowed, result.tests, counts)
 
 
 _LARGEST = 255
@@ -174,7 +205,7 @@ def _polygons(
     return Polygons(both, finite, jnp.concatenate(index), jnp.concatenate(drawn))
 
 
-def _seen_volumes(polygons: Polygons, drawn: Bool[Array, " polygons"], before: bool) -> Volumes:
+def _seen_volumes(polygons: Polygons, drawn: Bool[Array, " polygons"], before: bool, precision: Precision) -> Volumes:
     """The volumes of polygons as seen from the eye: beyond them, or `before` them.
 
     With barycentric weights that sum to the product of the face's normal over vertices at finite places, one formula
@@ -222,6 +253,7 @@ def _seen_volumes(polygons: Polygons, drawn: Bool[Array, " polygons"], before: b
         (last(offset, jnp.inf).astype(jnp.float32),),
     )  # fmt: skip
     zero = jnp.zeros(3, jnp.float64)
+    edges = in_precision(edges, precision)
     return Volumes(plane_table(edges), plane_table(nodes), keeps, tuple(zero), jnp.float64(0))
 
 

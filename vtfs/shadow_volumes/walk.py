@@ -19,6 +19,7 @@ from vtfs.shadow_volumes.planes import (
     PlaneTable,
     Vector,
     edge_planes,
+    in_precision,
     inside,
     node_planes,
     plane_table,
@@ -73,6 +74,7 @@ def volumes(frame: ShadowFrame, plan: ShadowPlan, about_light: bool) -> Volumes:
     light = rotated(frame, tuple(toward))
     edges, inward = edge_planes(vertex, frame.triangles, light, frame.directional, frame.bias_m, frame.culls_front)
     nodes = node_planes(edges, inward, vertex, frame.triangles, light, frame.directional, plan.extra, about_light)
+    edges = in_precision(edges, plan.precision)
     return Volumes(
         plane_table(edges), plane_table(nodes), inward != 0, tuple(zero) if frame.directional else light, frame.bias_m
     )
@@ -362,7 +364,7 @@ def _test_samples(
 ) -> UInt32[Array, "items words"]:
     """Which samples of each item's tile lie in a volume of its list."""
     capacity, lanes = lists.triangle.shape
-    n_samples = sample_rows.shape[2]
+    n_samples, dtype = sample_rows.shape[2], edges.values.dtype
     words = max(1, n_samples // 32)
     n_groups = jnp.minimum(lists.n_groups, capacity)
     chunk = max(1, _SAMPLES_AT_ONCE.get(jax.default_backend(), 0) // (lanes * n_samples))
@@ -376,8 +378,9 @@ def _test_samples(
     def test_chunk(first):
         group = first + jnp.arange(chunk, dtype=jnp.int32)
         row = sample_rows.at[jax.lax.dynamic_slice_in_dim(tile, first, chunk)].get(mode="promise_in_bounds")
-        position = tuple(row[:, c].astype(jnp.float64) - origin_m[c] for c in range(3))
-        moved = row[:, 3].astype(jnp.float64)
+        # Relative in float64 whatever the precision of the test: a scene far from its origin loses nothing.
+        position = tuple((row[:, c].astype(jnp.float64) - origin_m[c]).astype(dtype) for c in range(3))
+        moved = row[:, 3].astype(dtype)
         triangle = jax.lax.dynamic_slice_in_dim(lists.triangle, first, chunk)
         planes = edges.at(triangle)
         held = jnp.zeros((chunk, n_samples), bool)
@@ -428,7 +431,7 @@ def count_volumes(
         group = first + jnp.arange(chunk, dtype=jnp.int32)
         item = jax.lax.dynamic_slice_in_dim(item_of_group, first, chunk)
         row = rows[tile_of_item[item]]
-        position = tuple(row[:, c].astype(jnp.float64) for c in range(3))
+        position = tuple(row[:, c].astype(volume.edges.values.dtype) for c in range(3))
         planes = volume.edges.at(jax.lax.dynamic_slice_in_dim(triangle, first, chunk))
         held = jnp.zeros((chunk, n_samples), jnp.int32)
         for lane in range(lanes):
