@@ -36,6 +36,10 @@ SMALLEST_VOLUME = 1e-10
 vertices that it is summed from: it is seen edge-on, or narrower than 1e-10 rad. Rounding (2^-52) then moves the border
 of what is kept by at most 1e-5 of its size, and its orientation is certain."""
 
+LEAST_HEIGHT = 1e-12
+"""A triangle is left out, too, where the light is nearer to its plane than this share of its distance to a vertex, times
+the sine of the angle there: rounding is far below, and decides alone where the light is at a vertex."""
+
 BELOW_ZERO = -1e-300
 """Below zero, above every product that is not zero, and no subnormal, which some devices take for zero."""
 
@@ -151,6 +155,10 @@ def edge_planes(
     volume = -dot(face, light_m) if directional else dot(face, corner[0])
     bound = sum(length(normals[k]) * length(corner[k]) for k in range(3))
     safe = (jnp.abs(volume) > SMALLEST_VOLUME * bound) & jnp.isfinite(bound)
+    if not directional:
+        # Where the light is at a vertex the bound vanishes, and the volume is rounding.
+        edge_1, edge_2 = minus(corner[1], corner[0]), minus(corner[2], corner[0])
+        safe = safe & (jnp.abs(volume) > LEAST_HEIGHT * length(edge_1) * length(edge_2) * length(corner[0]))
     # Counter-clockwise as seen from the light: it sees the front.
     safe = safe & ~(culls_front & (volume < 0))
     inward = jnp.where(safe, jnp.where(volume > 0, 1.0, -1.0), 0.0)
