@@ -14,6 +14,7 @@ from vtfs.cli.listings import doctor, scenes, techniques
 from vtfs.cli.predict import predict
 from vtfs.cli.render import render
 from vtfs.cli.report import report
+from vtfs.cli.stability import stability
 from vtfs.cli.tune import tune
 from vtfs.input_error import InputError
 
@@ -26,7 +27,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-for _command in (tune, count, render, fit, predict, convert, report, scenes, techniques, doctor):
+for _command in (tune, count, render, stability, fit, predict, convert, report, scenes, techniques, doctor):
     app.command()(_command)
 
 _UsageError: Any = typer.BadParameter.__mro__[1]

@@ -37,8 +37,8 @@ vertices that it is summed from: it is seen edge-on, or narrower than 1e-10 rad.
 of what is kept by at most 1e-5 of its size, and its orientation is certain."""
 
 LEAST_HEIGHT = 1e-12
-"""A triangle is left out, too, where the light is nearer to its plane than this share of its distance to a vertex, times
-the sine of the angle there: rounding is far below, and decides alone where the light is at a vertex."""
+"""A triangle is left out, too, where its volume with the light is below this share of two of its edges times the
+distance of a vertex: rounding is far below, and decides alone where the light is at a vertex."""
 
 BELOW_ZERO = -1e-300
 """Below zero, above every product that is not zero, and no subnormal, which some devices take for zero."""

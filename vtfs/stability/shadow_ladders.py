@@ -19,7 +19,7 @@ N_TRIANGLES, N_VERTICES, N_EDGES = 640, 2048, 2048
 
 _BUILT_IN = "built-in"
 _N_BAD = 100
-_WAY = np.array([1.0, -0.3, 0.8])  # of offsets
+OFFSET_WAY = np.array([1.0, -0.3, 0.8])
 
 ShadowLadder = Ladder[ShadowCase]
 
@@ -106,7 +106,7 @@ def moved_ladders(stage: Stage, source: str) -> tuple[ShadowLadder, ...]:
     nothing = np.zeros(3)
 
     def offset(e: int) -> np.ndarray:
-        return _WAY * unit * 10.0**e
+        return OFFSET_WAY * unit * 10.0**e
 
     return (
         Ladder(

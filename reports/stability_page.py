@@ -1,0 +1,5 @@
+from pathlib import Path
+
+
+def write_stability_page(folder):
+    return Path(folder) / "x"
