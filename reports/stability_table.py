@@ -1,7 +1,8 @@
-"""What a stability result says: for each method and ladder, where it first fails, and how badly; and why."""
+"""What a stability result says: for each method and ladder where it first fails, how badly, and why."""
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -19,22 +20,21 @@ State = Literal["holds", "few", "fails", "refused", "not run"]
 class Cell:
     """One method on one ladder.
 
-    - `first`: the first rung on which it is wrong; `worst_share`: of what was tested, on `worst` rung.
-    - `ratio`: of light tests, the most that the lists held over what samples prove.
+    - `where`: the rungs on which it is wrong, or without an answer: "from 256", "at 1, from 1e4".
+    - `worst_share`: of what was tested, on `worst` rung.
     """
 
     state: State
-    first: str = ""
+    where: str = ""
     worst: str = ""
     worst_share: float = 0.0
-    ratio: float | None = None
 
     @property
     def text(self) -> str:
-        """In a word or two."""
-        if self.state == "holds":
-            return "holds"
-        return self.state if self.state == "not run" else f"from {self.first}" if self.first else self.state
+        """In a few words."""
+        if self.state in ("holds", "not run"):
+            return self.state
+        return f"refused {self.where}" if self.state == "refused" else self.where
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,30 @@ class LadderColumn:
 
 @dataclass(frozen=True)
 class Row:
-    """Methods whose cells are the same in all ladders, and why they fail where they do."""
+    """Methods whose cells are the same in all ladders, and why they fail where they do.
+
+    - `ratios`: of light tests, what lists held over what samples prove: on the middle rung and the most.
+    """
 
     methods: tuple[str, ...]
     cells: tuple[Cell, ...]
     why: str
+    ratios: tuple[float, float] | None = None
 
     @property
-    def is_peer(self) -> bool:
-        return self.methods[0].startswith("shadow_rays")
+    def worst_share(self) -> float:
+        return max((cell.worst_share for cell in self.cells), default=0.0)
+
+    @property
+    def state(self) -> State:
+        """The worst of its cells."""
+        order: tuple[State, ...] = ("holds", "not run", "refused", "few", "fails")
+        return max((cell.state for cell in self.cells), key=order.index, default="holds")
+
+    @property
+    def is_detail(self) -> bool:
+        """A variant that says little more than its siblings: stencils whose samples are tested in float32."""
+        return all(name.startswith("z_") and name.endswith("float32 test") for name in self.methods)
 
 
 @dataclass(frozen=True)
@@ -73,6 +88,23 @@ class StabilityTable:
     ladders: tuple[LadderColumn, ...]
     quiet: tuple[LadderColumn, ...]
     rows: tuple[Row, ...]
+
+    @property
+    def main_rows(self) -> tuple[Row, ...]:
+        return tuple(row for row in self.rows if not row.is_detail)
+
+    @property
+    def detail_rows(self) -> tuple[Row, ...]:
+        return tuple(row for row in self.rows if row.is_detail)
+
+    def with_state(self, state: State) -> tuple[Row, ...]:
+        """Main rows whose worst cell is in that state."""
+        return tuple(row for row in self.main_rows if row.state == state)
+
+    @property
+    def n_methods(self) -> int:
+        """Of the main rows."""
+        return sum(len(row.methods) for row in self.main_rows)
 
 
 def tables(result: StabilityResult) -> tuple[StabilityTable, ...]:
@@ -91,13 +123,16 @@ def _table(rungs: Sequence[RungResult], kind: Kind, source: str) -> StabilityTab
     cells = {name: {ladder: _cell(name, found) for ladder, found in by_ladder.items()} for name in methods}
     loud = [ladder for ladder in by_ladder if any(cells[name][ladder].state != "holds" for name in methods)]
     quiet = [ladder for ladder in by_ladder if ladder not in loud]
-    grouped: dict[tuple[Cell, ...], list[str]] = {}
+    grouped: dict[tuple[object, ...], list[str]] = {}
     for name in methods:
-        grouped.setdefault(tuple(cells[name][ladder] for ladder in by_ladder), []).append(name)
+        key = (*(cells[name][ladder] for ladder in by_ladder), _ratios(rungs, name))
+        grouped.setdefault(key, []).append(name)
     rows = []
     for of_it in grouped.values():
         wrong = {ladder: cells[of_it[0]][ladder] for ladder in loud}
-        rows.append(Row(tuple(of_it), tuple(wrong.values()), _why(kind, of_it[0], wrong)))
+        rows.append(Row(tuple(of_it), tuple(wrong.values()), _why(kind, of_it[0], wrong), _ratios(rungs, of_it[0])))
+    # Robust ones first, and tight ones.
+    rows.sort(key=lambda row: (row.worst_share, row.ratios or (0.0, 0.0)))
     return StabilityTable(
         kind,
         source,
@@ -117,14 +152,37 @@ def _cell(method: str, rungs: Sequence[RungResult]) -> Cell:
     found = [(rung.label, rung.verdicts[method]) for rung in rungs if method in rung.verdicts]
     if not found:
         return Cell("not run")
-    ratio = max((v.listed_ratio for _, v in found if v.listed_ratio is not None), default=None)
-    wrong = [(label, v) for label, v in found if v.wrong]
-    refused = [label for label, v in found if v.refused]
-    if not wrong:
-        return Cell("refused", refused[0], ratio=ratio) if refused else Cell("holds", ratio=ratio)
-    worst, verdict = max(wrong, key=lambda pair: pair[1].share)
+    labels = [label for label, _ in found]
+    if not any(v.wrong for _, v in found):
+        refused = [bool(v.refused) for _, v in found]
+        return Cell("refused", _where(labels, refused)) if any(refused) else Cell("holds")
+    worst, verdict = max(found, key=lambda pair: pair[1].share)
     state = "fails" if verdict.share > FEW else "few"
-    return Cell(state, wrong[0][0], worst, verdict.share, ratio)
+    return Cell(state, _where(labels, [v.wrong > 0 for _, v in found]), worst, verdict.share)
+
+
+def _where(labels: Sequence[str], is_wrong: Sequence[bool]) -> str:
+    """Runs of consecutive rungs; what goes on to the last rung is "from" its first."""
+    runs: list[list[int]] = []
+    for n, wrong in enumerate(is_wrong):
+        if wrong and runs and runs[-1][-1] == n - 1:
+            runs[-1].append(n)
+        elif wrong:
+            runs.append([n])
+    words = []
+    for run in runs:
+        first, last = labels[run[0]], labels[run[-1]]
+        if run[-1] == len(labels) - 1 and len(run) > 1:
+            words.append(f"from {first}")
+        else:
+            words.append(f"at {first}" if len(run) == 1 else f"{first} to {last}")
+    return ", ".join(words)
+
+
+def _ratios(rungs: Sequence[RungResult], method: str) -> tuple[float, float] | None:
+    found = [rung.verdicts[method].listed_ratio for rung in rungs if method in rung.verdicts]
+    known = [ratio for ratio in found if ratio is not None]
+    return (statistics.median(known), max(known)) if known else None
 
 
 def _why(kind: Kind, method: str, cells: dict[str, Cell]) -> str:

@@ -46,6 +46,10 @@ def stability(
         from reports.stability_page import write_stability_page
 
         page = write_stability_page(out)
+        if (out / "result.json").exists():  # of a run whose report now has it too
+            from reports.page import write_report
+
+            write_report(out)
     write_json(json_file, result.as_json())
     if json_file != "-":
         from reports.stability_text import stability_text

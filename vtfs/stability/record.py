@@ -77,7 +77,12 @@ class StabilityResult:
         return len(self.rungs) >= self.planned
 
     def as_json(self) -> dict[str, Any]:
-        return {"schema": SCHEMA, "complete": self.is_complete, **asdict(self)}
+        """What says nothing is left out of verdicts: most methods hold on most rungs."""
+        record = {"schema": SCHEMA, "complete": self.is_complete, **asdict(self)}
+        for rung in record["rungs"]:
+            for name, verdict in rung["verdicts"].items():
+                rung["verdicts"][name] = {key: value for key, value in verdict.items() if value}
+        return record
 
 
 def write_result(folder: Path, result: StabilityResult) -> Path:
