@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -86,8 +87,8 @@ class LightOutcome:
     verdicts: dict[str, LightVerdict]
 
 
-def judge_lights(case: LightCase) -> LightOutcome:
-    """Run all methods on a case."""
+def judge_lights(case: LightCase, methods: Sequence[LightMethod] = LIGHT_METHODS) -> LightOutcome:
+    """Run methods on a case."""
     reaches = _reaches(case)[case.samples.valid]
     exact, rounded = FrameInputs(case.samples, case.lights), FrameInputs(case.samples, _moved_in_float32(case))
 
@@ -103,7 +104,7 @@ def judge_lights(case: LightCase) -> LightOutcome:
         return LightVerdict(int((reaches & ~listed[cell]).sum()), int(listed.sum()), int((proven & listed).sum()))
 
     return LightOutcome(
-        int(case.samples.valid.sum()), int(reaches.sum()), {method.name: verdict(method) for method in LIGHT_METHODS}
+        int(case.samples.valid.sum()), int(reaches.sum()), {method.name: verdict(method) for method in methods}
     )
 
 

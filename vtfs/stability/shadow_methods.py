@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -82,15 +82,13 @@ class ShadowRunner:
     - `shapes`: what casters are padded to; none: as they are.
     """
 
-    def __init__(self, shapes: Shapes | None):
+    def __init__(self, shapes: Shapes | None, methods: Sequence[ShadowMethod] = SHADOW_METHODS):
         self._shapes = shapes
+        self._methods = tuple(methods)
         self._plans: dict[str, ShadowPlan] = {}
 
     def answers(self, case: ShadowCase, receives: np.ndarray) -> Iterator[tuple[ShadowMethod, np.ndarray | str]]:
-        """Each method's answer: which of the samples that receive light are in shadow, bool `[n]`; or why it has none.
-
-        Methods of one program follow one another.
-        """
+        """Of each method which samples that receive light are in shadow, bool `[n]`; or why it has no answer."""
         frame = functools.cache(lambda store: self._frame(case, receives, store))
         polygons = functools.cache(lambda technique, precision: self._polygons(technique, precision, frame("exact")))
 
@@ -105,7 +103,7 @@ class ShadowRunner:
                 runs = self._mask(method.technique, method.precision, frame(method.store))
             return from_runs(np.asarray(runs), case.samples.camera.viewport)[receives]
 
-        for method in SHADOW_METHODS:
+        for method in self._methods:
             try:
                 yield method, answer(method)
             except InputError as error:
