@@ -8,7 +8,7 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from reports.chart_style import chart_html
-from reports.charts import beyond_the_chart, speed_against_error, stage_times
+from reports.charts import beyond_the_chart, list_lengths, speed_against_error, stage_times
 from reports.model_charts import predicted_against_measured, time_along_parameters
 from reports.page_environment import page_environment
 from reports.pictures import heat_scale, read_pictures
@@ -23,6 +23,7 @@ _CHARTS = {
     "stage-times": stage_times,
     "predicted-against-measured": predicted_against_measured,
     "time-along-parameters": time_along_parameters,
+    "list-lengths": list_lengths,
 }
 
 

@@ -154,11 +154,7 @@ class ShadowRunner:
 
 @functools.cache
 def _polygon_program(technique: str, plan: ShadowPlan):
-    def run(frame: ShadowFrame):
-        counts, mask = count_polygons(frame, plan, by_failing=technique == "z_fail")
-        return counts, mask.overflowed
-
-    return jax.jit(run)
+    return jax.jit(lambda frame: count_polygons(frame, plan, by_failing=technique == "z_fail"))
 
 
 def _count(technique: str, plan: ShadowPlan, frame: ShadowFrame) -> tuple[PolygonCounts, bool]:
