@@ -279,8 +279,9 @@ def is_excused(
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
     down = np.cross(way, across)
 
-    def is_right(moved_m: np.ndarray, moved_bias_m: float, own: np.ndarray | None = None) -> np.ndarray:
-        return brute_force(moved_m, casters, light, moved_bias_m, origin, own) == shadowed
+    def is_right(moved_m: np.ndarray, moved_bias_m: float) -> np.ndarray:
+        # Moved, a sample may lie below its own triangle.
+        return brute_force(moved_m, casters, light, moved_bias_m, origin, own_triangle) == shadowed
 
     by_edge = np.zeros(len(points_m), bool)
     for share in (0.25, 1.0):
@@ -292,7 +293,7 @@ def is_excused(
         by_edge[left] = _is_near_an_edge(-way[left], casters, origin + homogeneous[:3])
     by_plane = np.zeros(len(points_m), bool)
     for biases in (1 - PLANE_BAND_BIASES, 0.0, 1 + PLANE_BAND_BIASES):
-        by_plane |= is_right(points_m, biases * bias_m, own_triangle)
+        by_plane |= is_right(points_m, biases * bias_m)
     return by_edge, by_plane
 
 
