@@ -67,8 +67,9 @@ class Row:
     @property
     def state(self) -> State:
         """The worst of its cells."""
-        order: tuple[State, ...] = ("holds", "not run", "refused", "few", "fails")
-        return max((cell.state for cell in self.cells), key=order.index, default="holds")
+        found = {"holds", *(cell.state for cell in self.cells)}
+        order: list[State] = ["fails", "few", "refused", "not run", "holds"]
+        return next(state for state in order if state in found)
 
     @property
     def is_detail(self) -> bool:
@@ -109,9 +110,10 @@ class StabilityTable:
 
 def tables(result: StabilityResult) -> tuple[StabilityTable, ...]:
     """In the order of the run: the user's scene first, shadows before lights."""
-    places = dict.fromkeys((rung.kind, rung.source) for rung in result.rungs)
+    places: list[tuple[Kind, str]] = [(rung.kind, rung.source) for rung in result.rungs]
     return tuple(
-        _table([rung for rung in result.rungs if (rung.kind, rung.source) == place], *place) for place in places
+        _table([rung for rung in result.rungs if (rung.kind, rung.source) == (kind, source)], kind, source)
+        for kind, source in dict.fromkeys(places)
     )
 
 

@@ -23,8 +23,8 @@ def wrong(n: int, of: int = 1000) -> Verdict:
     return Verdict(n, 0, n, 0, n / of)
 
 
-def rung(ladder: str, label: str, kind="shadow", **verdicts: Verdict) -> RungResult:
-    return RungResult(ladder, f"Title of {ladder}", "built-in", kind, label, 1000, 600, 400, verdicts)
+def rung(ladder: str, label: str, **verdicts: Verdict) -> RungResult:
+    return RungResult(ladder, f"Title of {ladder}", "built-in", "shadow", label, 1000, 600, 400, verdicts)
 
 
 def a_result(*rungs: RungResult) -> StabilityResult:
@@ -91,7 +91,7 @@ def test_the_page_says_it_in_words(tmp_path):
 
 
 def test_hostile_names_stay_text(tmp_path):
-    write_result(tmp_path, a_result(replace(rung("nested", EVIL, **{EVIL: wrong(90)}), title=EVIL, source=EVIL)))
+    write_result(tmp_path, a_result(replace(rung("nested", EVIL), verdicts={EVIL: wrong(90)}, title=EVIL, source=EVIL)))
     page = write_stability_page(tmp_path).read_text(encoding="utf-8")
     assert "<script>alert(1)" not in page and "<img src=x" not in page and Reader(page).text.count("{{ 7 * 7 }}") >= 2
 
