@@ -72,7 +72,8 @@ def main() -> None:
     except BrokenPipeError:
         code = 1
     if code == _INTERRUPTED:
-        kept = "; what was measured is kept, --resume goes on from there" if _command_of(arguments) == "tune " else ""
+        resumes = _command_of(arguments) in ("tune ", "stability ")
+        kept = "; what was measured is kept, --resume goes on from there" if resumes else ""
         _leave(f"interrupted{kept}.", _INTERRUPTED)
     sys.exit(code if isinstance(code, int) else 0)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from vtfs.camera import Camera
 from vtfs.input_error import InputError
+from vtfs.lights import Lights
 from vtfs.scene_setup import SceneSetup
 from vtfs.shadow_casters import BIAS, Casters, ShadowLight
 from vtfs.shadow_mask import facing_samples
@@ -28,7 +29,7 @@ _MOST_PAIRS = 4e8
 class OwnScene:
     """A frame of the user's scene, its opaque casters and one of its lights.
 
-    - `description`: for the record.
+    - `own_triangle`: the caster on which each sample lies, `[h, w]`, -1 for none. `description`: for the record.
     """
 
     name: str
@@ -36,7 +37,7 @@ class OwnScene:
     casters: Casters
     own_triangle: np.ndarray
     light: ShadowLight
-    lights: Any
+    lights: Lights
     description: dict[str, Any]
 
     def shadow_ladders(self) -> tuple[Ladder[ShadowCase], ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,11 +12,12 @@ from vtfs.device import device_name, versions
 from vtfs.input_error import InputError
 from vtfs.stability.ladder import Ladder
 from vtfs.stability.light_ladders import light_ladders
-from vtfs.stability.light_methods import judge_lights
+from vtfs.stability.light_methods import LightCase, judge_lights
 from vtfs.stability.record import FILE, Kind, RungResult, StabilityResult, Verdict, read_result, write_result
 from vtfs.stability.shadow_ladders import N_EDGES, N_TRIANGLES, N_VERTICES, built_in_ladders
 from vtfs.stability.shadow_methods import ShadowRunner, Shapes
 from vtfs.stability.shadow_verdicts import judge_shadows
+from vtfs.stability.stage import ShadowCase
 
 if TYPE_CHECKING:
     from vtfs.stability.own_scene import OwnScene
@@ -106,7 +107,7 @@ def _jobs(seed: int, own: OwnScene | None) -> Iterator[_Job]:
     yield from _light_jobs(light_ladders(seed))
 
 
-def _shadow_jobs(ladders, runner: ShadowRunner) -> Iterator[_Job]:
+def _shadow_jobs(ladders: Iterable[Ladder[ShadowCase]], runner: ShadowRunner) -> Iterator[_Job]:
     for ladder in ladders:
         for rung in ladder.rungs:
 
@@ -130,7 +131,7 @@ def _shadow_jobs(ladders, runner: ShadowRunner) -> Iterator[_Job]:
             yield _Job(ladder, "shadow", rung.label, judge)
 
 
-def _light_jobs(ladders) -> Iterator[_Job]:
+def _light_jobs(ladders: Iterable[Ladder[LightCase]]) -> Iterator[_Job]:
     for ladder in ladders:
         for rung in ladder.rungs:
 

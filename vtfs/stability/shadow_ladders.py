@@ -20,6 +20,7 @@ N_TRIANGLES, N_VERTICES, N_EDGES = 640, 2048, 2048
 _BUILT_IN = "built-in"
 _N_BAD = 100
 OFFSET_WAY = np.array([1.0, -0.3, 0.8])
+"""In which offsets go, over their size."""
 
 ShadowLadder = Ladder[ShadowCase]
 
@@ -39,7 +40,7 @@ def built_in_ladders(seed: int) -> tuple[ShadowLadder, ...]:
     misses = [*((power_of_ten(e), 10.0**e) for e in (-2, -4, -6, -7, -8, -10, -12, -14, -15)), ("0", 0.0)]
     shares = [*((power_of_ten(e), 10.0**e) for e in exponents), ("0", 0.0)]
     return (
-        *moved_ladders(stage, _BUILT_IN),
+        *_moved_ladders(stage),
         of(
             "aim",
             "Samples beside a vertex of a closed mesh, angle at the light",
@@ -66,7 +67,7 @@ def built_in_ladders(seed: int) -> tuple[ShadowLadder, ...]:
             "Light over a table top, height over the extent",
             [(label, lambda s=share: _over_table(stage, s)) for label, share in shares],
         ),
-        *view_ladders(stage, _BUILT_IN),
+        *_view_ladders(stage),
         of("nested", "Nested volumes over a sample", [(str(n), lambda n=n: _nested(stage, n, False)) for n in _COUNTS]),
         of(
             "camera_inside",
@@ -99,7 +100,7 @@ def built_in_ladders(seed: int) -> tuple[ShadowLadder, ...]:
     )
 
 
-def moved_ladders(stage: Stage, source: str) -> tuple[ShadowLadder, ...]:
+def _moved_ladders(stage: Stage) -> tuple[ShadowLadder, ...]:
     """Offsets and scales of a whole view."""
     # A scene of a metre across a kilometre off is one of a hundred metres a hundred kilometres off.
     unit = stage.extent_m / 10
@@ -112,7 +113,7 @@ def moved_ladders(stage: Stage, source: str) -> tuple[ShadowLadder, ...]:
         Ladder(
             "offset",
             "Offset from the origin, over a tenth of the extent",
-            source,
+            _BUILT_IN,
             (
                 Rung("0", _case(lambda: stage)),
                 *(Rung(power_of_ten(e), _case(lambda e=e: stage.moved(1.0, offset(e)))) for e in range(7)),
@@ -121,13 +122,13 @@ def moved_ladders(stage: Stage, source: str) -> tuple[ShadowLadder, ...]:
         Ladder(
             "scale",
             "Scale of everything",
-            source,
+            _BUILT_IN,
             tuple(Rung(power_of_ten(e), _case(lambda e=e: stage.moved(10.0**e, nothing))) for e in range(-3, 7)),
         ),
     )
 
 
-def view_ladders(stage: Stage, source: str) -> tuple[ShadowLadder, ...]:
+def _view_ladders(stage: Stage) -> tuple[ShadowLadder, ...]:
     """A light that comes to the camera; near and far planes."""
     eye = np.array(stage.camera.eye_m)
     way = np.array([0.3, 0.8, 0.5])
@@ -140,7 +141,7 @@ def view_ladders(stage: Stage, source: str) -> tuple[ShadowLadder, ...]:
         Ladder(
             "light_to_camera",
             "Light at the camera, distance over the extent",
-            source,
+            _BUILT_IN,
             (
                 *(
                     Rung(power_of_ten(e), _case(lambda e=e: stage.lit_from(eye + way * extent_m * 10.0**e)))
@@ -152,7 +153,7 @@ def view_ladders(stage: Stage, source: str) -> tuple[ShadowLadder, ...]:
         Ladder(
             "near",
             "Near plane, over the extent",
-            source,
+            _BUILT_IN,
             tuple(
                 Rung(power_of_ten(e), _case(lambda e=e: lens(extent_m * 10.0**e, far_m)))
                 for e in (-2, -3, -4, -5, -6, -8, -10, -20)
@@ -161,7 +162,7 @@ def view_ladders(stage: Stage, source: str) -> tuple[ShadowLadder, ...]:
         Ladder(
             "far",
             "Far plane, over the extent",
-            source,
+            _BUILT_IN,
             (
                 *(
                     Rung(power_of_ten(e), _case(lambda e=e: lens(near_m, extent_m * 10.0**e)))
