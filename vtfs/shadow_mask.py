@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vtfs.cluster_grid import ClusterGrid
 from vtfs.gbuffer import Fragments, Positions, to_runs
 from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight
-from vtfs.shadow_volumes.planes import Extra
+from vtfs.shadow_volumes.planes import Extra, Precision
 
 if TYPE_CHECKING:
     from vtfs.view_samples import ViewSamples
@@ -63,6 +63,7 @@ class ShadowPlan:
     - `stencil`: of z-pass and z-fail: 8 bits that wrap or saturate, or no limit; `around_eye`: z-pass starts with the
       volumes
       around the eye, without which it fails where the camera stands in one.
+    - `precision`: in which samples are tested against planes. float32 leaks at vertices: it is there to show that.
     - `clusters`, `groups`, `leaf_groups`, `pairs`, `cells`: rounded capacities: of clusters and their blocks, of the
       lists of a level, of the lists of tiles or clusters, of what goes on to a second pass, of the full tree.
     - `level_groups`: capacities of each level's lists. Then levels are unrolled and nothing loops, which suits a GPU;
@@ -80,6 +81,7 @@ class ShadowPlan:
     tree: Tree = "compact"
     stencil: Stencil = "unlimited"
     around_eye: bool = True
+    precision: Precision = "float64"
     clusters: int = 0
     groups: int = 0
     leaf_groups: int = 0
