@@ -344,25 +344,24 @@ class PlaneTable(eqx.Module, Generic[Planes]):
     def at(self, triangle: Int[Array, "*n"]) -> Planes:
         """The planes of some triangles."""
         leaves, structure = jax.tree.flatten(self.layout)
-        axis = _component_axis()
-        if axis == 0:
-            rows = self.values.at[:, triangle].get(mode="promise_in_bounds")
+        if _are_side_by_side():
+            rows = jnp.moveaxis(self.values.at[triangle].get(mode="promise_in_bounds"), -1, 0)
         else:
-            rows = self.values.at[triangle].get(mode="promise_in_bounds")
-        columns = [jax.lax.index_in_dim(rows, k, axis, keepdims=False) for k in range(len(leaves))]
-        return jax.tree.unflatten(
-            structure, [column.astype(leaf.dtype) for column, leaf in zip(columns, leaves, strict=True)]
-        )
+            rows = self.values.at[:, triangle].get(mode="promise_in_bounds")
+        return jax.tree.unflatten(structure, [row.astype(leaf.dtype) for row, leaf in zip(rows, leaves, strict=True)])
 
 
-def _component_axis() -> int:
-    return 0 if jax.default_backend() == "cpu" else -1
+def _are_side_by_side() -> bool:
+    return jax.default_backend() != "cpu"
 
 
 def plane_table(planes: Planes) -> PlaneTable[Planes]:
     leaves, structure = jax.tree.flatten(planes)
     layout = jax.tree.unflatten(structure, [_Dtype(leaf.dtype) for leaf in leaves])
-    values = jnp.stack([leaf.astype(leaves[0].dtype) for leaf in leaves], axis=_component_axis())
+    values = jnp.stack([leaf.astype(leaves[0].dtype) for leaf in leaves])
+    if _are_side_by_side():
+        # Two kernels that write what lies together: stacked the other way, each write would be on its own.
+        values = jax.lax.optimization_barrier(values).T
     return PlaneTable(values, layout)
 
 
