@@ -15,60 +15,22 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from benchmarks.shadow_cases import LIGHT, at_size, clumps_scene
-from vtfs.camera import load_cameras
+from benchmarks.shadow_cases import Case, read_case
 from vtfs.device import device_name, keep_compiled_programs, versions
 from vtfs.files import write_atomically
-from vtfs.gallery import GALLERY, build_scene
 from vtfs.gbuffer import from_runs
-from vtfs.scene import load_scene
-from vtfs.shadow_casters import Casters, ShadowLight, opaque_casters
-from vtfs.shadow_mask import ShadowPlan, casters_on_device, default_bias_m, facing_samples, shadow_frame
+from vtfs.shadow_mask import ShadowPlan, casters_on_device, shadow_frame
 from vtfs.shadow_references import ShadowRays, brute_force, classify, view_points_m
 from vtfs.shadow_techniques import fitted, run_program, shadow_counts, shadow_grid, shadow_program
-from vtfs.view_samples import ViewSamples, trace_view_samples
 
 N_CHECKED, N_CLASSIFIED = 2_000, 400
 BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (8, 16, 4, 32, 2)
-
-
-@dataclass(frozen=True)
-class Case:
-    """One view of one scene with one light."""
-
-    name: str
-    samples: ViewSamples
-    casters: Casters
-    light: ShadowLight
-    receives: np.ndarray
-    bias_m: float
-
-
-def read_case(arguments: argparse.Namespace) -> Case:
-    if arguments.scene == "clumps":
-        scene, light = clumps_scene(arguments.triangles), LIGHT
-    elif arguments.scene in GALLERY:
-        scene, light = build_scene(arguments.scene, arguments.triangles), None
-    else:
-        scene, light = load_scene(Path(arguments.scene)), None
-    path = load_cameras(Path(arguments.cameras)) if arguments.cameras else scene.cameras
-    if path is None:
-        raise SystemExit(f"{arguments.scene}: has no cameras; give --cameras FILE.")
-    samples = trace_view_samples(scene, at_size(path.camera(arguments.frame), arguments.size))
-    if light is None:
-        low, high = scene.bounds_m
-        light = ShadowLight(tuple(low + (high - low) * np.array([0.45, 0.8, 0.55])))
-    casters = opaque_casters(scene)
-    # The case of the rays tests every valid sample; elsewhere those that face the light.
-    receives = samples.valid if arguments.scene == "clumps" else facing_samples(samples, light)
-    name = f"{scene.name} ({casters.n_triangles:,} triangles, {arguments.size} squared)"
-    return Case(name, samples, casters, light, receives, default_bias_m(casters))
 
 
 def variants(which: str) -> Iterator[tuple[str, ShadowPlan]]:
@@ -160,7 +122,7 @@ def main() -> None:
     arguments = parser.parse_args()
     end = time.monotonic() + 60 * arguments.minutes
     keep_compiled_programs()
-    case = read_case(arguments)
+    case = read_case(arguments.scene, arguments.cameras, arguments.triangles, arguments.frame, arguments.size)
     rays, by_rays = embree(case)
     record = {"scene": case.name, "device": device_name(), "versions": versions(), "embree": rays, "results": []}
     print(f"{case.name}, {device_name()}: {rays['rays']:,} samples, {by_rays.mean():.1%} in shadow", flush=True)
