@@ -1,4 +1,4 @@
-"""Built-in scenes: an atrium, a street and a grove, made to any triangle count from 1k to 1M.
+"""Built-in scenes: an atrium, a street, a grove and a conservatory, made to any triangle count from 1k to 1M.
 
 A scene is laid out for a triangle count, which decides what stands in it, and for a level of detail, which decides how
 finely it is tessellated; the level is searched so that the count comes out, and only then is anything built. Metres, y
@@ -14,6 +14,7 @@ import numpy as np
 
 from vtfs.camera import CameraPath
 from vtfs.gallery_scenes.atrium import atrium, atrium_path
+from vtfs.gallery_scenes.conservatory import conservatory, conservatory_path
 from vtfs.gallery_scenes.grove import grove, grove_path
 from vtfs.gallery_scenes.layout import Detail, Layout
 from vtfs.gallery_scenes.street import street, street_path
@@ -86,5 +87,8 @@ GALLERY: dict[str, Builtin] = {
     "atrium": Builtin("two-storey courtyard with colonnades, curtains and a balcony", 60_000, atrium, atrium_path),
     "street": Builtin("street with house fronts, windows, lamps, kerbs and cars", 60_000, street, street_path),
     "grove": Builtin("trees of alpha-tested leaf cards on uneven ground", 100_000, grove, grove_path),
+    "conservatory": Builtin(
+        "glass hall with stained panes and alpha-tested plants", 60_000, conservatory, conservatory_path
+    ),
 }
 """The built-in scenes, in the order in which they are shown; the first is the default."""

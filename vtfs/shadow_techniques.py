@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from vtfs.cluster_grid import cluster_grid
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
+from vtfs.parameters import Configuration
 from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight
 from vtfs.shadow_mask import (
     ShadowFrame,
@@ -33,6 +34,7 @@ from vtfs.shadow_volumes.z_pass import z_pass
 from vtfs.view_samples import ViewSamples
 
 if TYPE_CHECKING:
+    from vtfs.camera import Camera
     from vtfs.cluster_grid import ClusterGrid
 
 log = logging.getLogger("vtfs.shadows")
@@ -47,6 +49,47 @@ SHADOW_TECHNIQUES: dict[str, ShadowTechnique] = {
 }
 """Shadow techniques of one signature. What differs from one plan to another is in the plan."""
 
+
+def shadow_plan(config: Configuration) -> ShadowPlan:
+    """The static part of a configuration of a shadow technique, without capacities."""
+    params = config.params
+    extra = "silhouette" if config.technique == "ptsv" else "vertex"
+    return ShadowPlan(
+        tile_px=int(params.get("tile_px", 8)),
+        branching=int(params.get("branching", 32)),
+        bounds=params.get("bounds", "explicit"),  # type: ignore[arg-type]
+        extra=extra if params.get("planes", "off") == "on" else "off",
+        feedback=params.get("feedback") == "on",
+        batch=int(params.get("batch", 0)),
+        stencil=params.get("stencil", "unlimited"),  # type: ignore[arg-type]
+        around_eye=params.get("around_eye") == "on",
+        passes=int(params.get("passes", 1)),
+        level=int(params.get("level", 0)),
+        tree=params.get("tree", "compact"),  # type: ignore[arg-type]
+    )
+
+
+def shadow_sizes(plan: ShadowPlan) -> tuple[int, ...]:
+    """The capacities of a plan, as numbers of which the larger one holds more."""
+    return plan.clusters, plan.groups, plan.leaf_groups, plan.pairs, plan.cells, *plan.level_groups
+
+
+def with_shadow_sizes(plan: ShadowPlan, sizes: tuple[int, ...]) -> ShadowPlan:
+    """The plan with such capacities; none where they are not known yet."""
+    if not sizes:
+        return plan
+    clusters, groups, leaf_groups, pairs, cells, *level_groups = sizes
+    return replace(
+        plan,
+        clusters=clusters,
+        groups=groups,
+        leaf_groups=leaf_groups,
+        pairs=pairs,
+        cells=cells,
+        level_groups=tuple(level_groups),
+    )
+
+
 _FIRST = ShadowPlan(clusters=2**12, groups=2**10, leaf_groups=2**13)
 _LARGEST = 2**26
 
@@ -57,8 +100,12 @@ def shadow_grid(samples: ViewSamples, tile_px: int, depth_slices: int = 0) -> Cl
     **Raises:** `InputError` where it has more columns, rows or slices than keys can tell apart.
     """
     depths = -samples.position_m[..., 2][samples.valid]
-    deepest_m = float(depths.max(initial=samples.camera.near_m))
-    grid = cluster_grid(samples.camera, tile_px, depth_slices, deepest_m)
+    return grid_of(samples.camera, float(depths.max(initial=samples.camera.near_m)), tile_px, depth_slices)
+
+
+def grid_of(camera: Camera, deepest_m: float, tile_px: int, depth_slices: int) -> ClusterGrid:
+    """The same, of a camera whose deepest sample is known."""
+    grid = cluster_grid(camera, tile_px, depth_slices, deepest_m)
     n_slices = int(grid.depth_slices)
     if n_slices > 2**KEY_BITS:
         raise InputError(
@@ -112,32 +159,52 @@ def fitted(technique: str, plan: ShadowPlan, frame: ShadowFrame, unrolled: bool 
 
     - `unrolled`: without loops, each level with its own capacity; unless given, where the device is no CPU.
     """
-    n_samples = int(np.prod(frame.receives.shape))
-    viewport = frame.positions.viewport
+    return fitted_to_all(technique, plan, [frame], unrolled)[0]
+
+
+def fitted_to_all(
+    technique: str,
+    plan: ShadowPlan,
+    frames: Sequence[ShadowFrame],
+    unrolled: bool | None = None,
+    run: Callable[[ShadowPlan, int], ShadowMask] | None = None,
+) -> tuple[ShadowPlan, list[ShadowMask]]:
+    """The plan with capacities that hold all of several frames, and their masks; see `fitted`.
+
+    **Arguments:**
+
+    - `run`: a plan on one of the frames; by `run_program` unless given.
+    """
+    run = run or (lambda plan, i: run_program(technique, plan, frames[i]))
+    n_samples = int(np.prod(frames[0].receives.shape))
+    n_triangles = frames[0].triangles.shape[0]
+    viewport = frames[0].positions.viewport
     if plan.tree == "full":
         columns, rows = -(-viewport.width_px // plan.tile_px), -(-viewport.height_px // plan.tile_px)
-        plan = replace(plan, cells=n_cells(columns, rows, int(frame.grid.depth_slices), plan.branching))
+        n_slices = max(int(frame.grid.depth_slices) for frame in frames)
+        plan = replace(plan, cells=n_cells(columns, rows, n_slices, plan.branching))
     plan = replace(
         plan,
         clusters=plan.clusters or _rounded_up("clusters", n_samples // 8, _FIRST.clusters),
-        groups=plan.groups or _rounded_up("lists", 2 * frame.triangles.shape[0], _FIRST.groups),
+        groups=plan.groups or _rounded_up("lists", 2 * n_triangles, _FIRST.groups),
         leaf_groups=plan.leaf_groups or _rounded_up("leaf lists", n_samples // 8, _FIRST.leaf_groups),
-        pairs=plan.pairs or (_rounded_up("pairs", 4 * frame.triangles.shape[0], 2**10) if plan.passes == 2 else 0),
+        pairs=plan.pairs or (_rounded_up("pairs", 4 * n_triangles, 2**10) if plan.passes == 2 else 0),
         level_groups=(),
     )
     while True:
-        mask = run_program(technique, plan, frame)
-        needed = np.asarray(mask.counts.groups).astype(np.int64)
-        if not bool(mask.overflowed):
+        masks = [run(plan, i) for i in range(len(frames))]
+        needed = np.max([np.asarray(mask.counts.groups) for mask in masks], axis=0).astype(np.int64)
+        if not any(bool(mask.overflowed) for mask in masks):
             break
-        n_blocks = int(mask.counts.n_blocks)
+        n_blocks = max(int(mask.counts.n_blocks) for mask in masks)
+        n_pairs = max(int(mask.counts.n_pairs) for mask in masks)
         grown = replace(plan, clusters=_rounded_up("clusters", n_blocks, plan.clusters))
         if n_blocks <= plan.clusters:  # else the lists are meaningless
             grown = replace(
                 grown,
                 groups=_rounded_up("lists", _more(needed[:-1].max(), plan.groups), plan.groups),
                 leaf_groups=_rounded_up("leaf lists", _more(needed[-1], plan.leaf_groups), plan.leaf_groups),
-                pairs=_rounded_up("pairs", int(mask.counts.n_pairs), plan.pairs) if plan.pairs else 0,
+                pairs=_rounded_up("pairs", n_pairs, plan.pairs) if plan.pairs else 0,
             )
         log.info("%s: %s does not fit, trying %s", technique, plan, grown)
         if grown == plan:
@@ -147,7 +214,7 @@ def fitted(technique: str, plan: ShadowPlan, frame: ShadowFrame, unrolled: bool 
         levels = tuple(_rounded_up_finely(int(n)) for n in needed[1:-1])
         if levels:
             plan = replace(plan, level_groups=levels, leaf_groups=_rounded_up_finely(int(needed[-1])), groups=0)
-    return plan
+    return plan, masks
 
 
 def _rounded_up_finely(needed: int) -> int:
@@ -265,6 +332,20 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
         "memory": _memory(plan, frame),
         **per_level,
     }
+
+
+def shadows_counts(of_each: Sequence[dict[str, int]]) -> dict[str, int]:
+    """Counts of the shadows of several lights and views: sums, but what is held or longest is that of the largest.
+
+    Names that shading has too are told apart: `shadow_samples` receive shadow, `shadow_clusters` are what is walked.
+    """
+    largest = {"memory", "longest_list", "casters"}
+    total = {
+        name: (max if name in largest else sum)(counts.get(name, 0) for counts in of_each)
+        for name in dict.fromkeys(name for counts in of_each for name in counts)
+    }
+    names = {"samples": "shadow_samples", "items": "shadow_clusters", "longest_list": "longest_shadow_list"}
+    return {names.get(name, name): value for name, value in total.items()}
 
 
 def _memory(plan: ShadowPlan, frame: ShadowFrame) -> int:

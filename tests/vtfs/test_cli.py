@@ -1,6 +1,7 @@
 """The command line as a new user meets it: help, counts, pictures, and one line for whatever is wrong."""
 
 import csv
+import importlib.metadata
 import json
 import os
 import subprocess
@@ -69,6 +70,10 @@ def test_every_command_has_help(command):
 def test_without_a_command_there_is_help():
     assert vtfs() == vtfs("--help") == vtfs("-h")
     assert vtfs().code == 0
+
+
+def test_the_version_is_the_packages():
+    assert vtfs("--version").out == f"vtfs {importlib.metadata.version('vtfs')}\n"
 
 
 def test_scenes_and_techniques_list_everything_there_is():
@@ -293,7 +298,7 @@ OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
     ("name", "content", "words"),
     [
         ("none.glb", None, ("none.glb", "no such file")),
-        ("nosuch", None, ("nosuch", "atrium, street, grove")),
+        ("nosuch", None, ("nosuch", "atrium, street, grove, conservatory")),
         ("a.blend", "", ("a.blend", "`.blend`", ".glb")),
         ("cut.glb", cut_glb, ("cut.glb", "truncated")),
         ("nan.obj", OBJ.replace("v 0 1 0", "v 0 nan 0"), ("nan.obj", "NaN")),
@@ -417,6 +422,7 @@ def test_a_space_that_is_wrong(content, words):
         (("--nope",), ("--nope", "--help")),
         (("count", "--nope"), ("--nope", "vtfs count --help")),
         (("nosuch",), ("nosuch",)),
+        (("tuna",), ("tuna", "Did you mean 'tune'? See vtfs --help.")),
         (("count", "--lights"), ("--lights", "argument")),
         (("count", "--frame", "abc"), ("--frame", "integer")),
         (("count", "--seed", "1.5"), ("--seed", "integer")),

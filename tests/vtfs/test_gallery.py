@@ -1,5 +1,7 @@
 """The built-in scenes: what was asked for, again and again the same, with a camera that keeps clear."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from vtfs.camera import Viewport
 from vtfs.gallery import GALLERY, build_scene
 from vtfs.input_error import InputError
 from vtfs.tracer import Tracer
+from vtfs.view_samples import trace_view_samples
 
 
 @pytest.mark.parametrize("name", GALLERY)
@@ -24,7 +27,8 @@ def test_a_scene_is_made_of_what_it_promises(name):
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     assert (area > 0).mean() > 0.95  # all but the poles of balls
     masked = [material.alpha_image is not None for material in scene.materials]
-    assert any(masked) == (name == "grove")
+    assert any(masked) == (name in ("grove", "conservatory"))
+    assert any(material.alpha_mode == "blend" for material in scene.materials) == (name == "conservatory")
     if name == "grove":
         assert np.array(masked)[scene.material_index].mean() > 0.6
 
@@ -57,3 +61,16 @@ def test_the_camera_never_comes_near_a_surface(name, seed):
 def test_what_is_not_there_is_refused(name, n, message):
     with pytest.raises(InputError, match=message):
         build_scene(name, n)
+
+
+def test_the_conservatory_shows_blended_samples_along_its_whole_path():
+    scene = build_scene("conservatory", 20_000)
+    assert scene.cameras is not None
+    tracer, shares, most = Tracer(scene), [], 0
+    for frame in range(0, len(scene.cameras), 6):
+        camera = replace(scene.cameras.camera(frame), viewport=Viewport(64, 36))
+        layers = trace_view_samples(scene, camera, tracer).layers.transparent
+        shares.append(np.mean(np.any([layer.samples.valid for layer in layers], axis=0)))
+        most = max(most, len(layers))
+    # From a third of the image where the eye looks along the hall to all of it before the screen.
+    assert min(shares) > 0.25 and max(shares) > 0.85 and most >= 3

@@ -340,7 +340,8 @@ def test_mismatches_are_told_apart():
 
 @functools.cache
 def real_case(frame: int):
-    """One view of a real scene at 256 squared, and what brute force says of it: four thousand million pairs."""
+    """One view of a real scene at 256 squared, and what brute force says of one sample in each 2 by 2 pixels: a
+    thousand million pairs."""
     scenes = Path(__file__).parents[3] / "shared" / "scenes"
     scene = load_scene(scenes / "zdm2.glb")
     camera = load_cameras(scenes / "zdm2.cameras.json").camera(frame)
@@ -348,9 +349,11 @@ def real_case(frame: int):
     low, high = scene.bounds_m
     light = ShadowLight(tuple(low + (high - low) * np.array([0.45, 0.8, 0.55])))
     casters, receives = opaque_casters(scene), facing_samples(samples, light)
-    points = view_points_m(samples, receives)
+    asked = np.zeros_like(receives)
+    asked[::2, ::2] = receives[::2, ::2]
+    points = view_points_m(samples, asked)
     reference = brute_force(points, casters, light, default_bias_m(casters), np.array(camera.eye_m))
-    return samples, casters, light, receives, points, reference
+    return samples, casters, light, receives, asked, points, reference
 
 
 @pytest.mark.shared
@@ -367,9 +370,9 @@ def real_case(frame: int):
     ids=str,
 )
 def test_every_variant_on_a_real_scene(technique, plan, frame):
-    samples, casters, light, receives, points, reference = real_case(frame)
+    samples, casters, light, receives, asked, points, reference = real_case(frame)
     mask = cast_shadows(technique, plan, samples, casters, light, receives=receives).shadowed
-    differs = mask[receives] != reference
+    differs = mask[asked] != reference
     found = classify(points, differs, casters, light, default_bias_m(casters), np.array(samples.camera.eye_m))
     assert found.errors == 0 and found.total <= 1e-3 * len(points)
     assert not mask[~receives].any() and 0.02 < reference.mean() < 0.98

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -26,6 +26,24 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"vtfs {version('vtfs')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
 for _command in (tune, count, render, fit, predict, convert, report, scenes, techniques, doctor):
     app.command()(_command)
 
@@ -43,7 +61,9 @@ def main() -> None:
     except InputError as error:
         _leave(str(error), 2)
     except _UsageError as error:
-        _leave(f"{error.format_message().rstrip('.')}; see vtfs {_command_of(arguments)}--help.", 2)
+        message = error.format_message().rstrip(".")
+        joint = " See" if message.endswith("?") else "; see"
+        _leave(f"{message}{joint} vtfs {_command_of(arguments)}--help.", 2)
     except MemoryError:
         _leave("this machine's memory is full; try a smaller --size, fewer lights or a smaller scene.", 1)
     except (KeyboardInterrupt, typer.Abort):

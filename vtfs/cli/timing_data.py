@@ -46,7 +46,7 @@ MapOption = Annotated[
     Path | None,
     typer.Option(
         "--map",
-        help="What a CSV file's columns are, as TOML: time, unit, ignore, labels and a table [rename].",
+        help="What a CSV file's columns are, as TOML: time, unit, ignore, labels and a table named rename.",
         metavar="FILE",
         rich_help_panel=_PANEL,
     ),
