@@ -70,8 +70,8 @@ class Case:
     bias_m: float
 
 
-def read_case(scene_name: str, cameras: str | None, n_triangles: int, frame: int, size_px: int) -> Case:
-    """A view of the clumps, of a built-in scene or of a file.
+def read_case(scene_name: str, cameras: str | None, n_triangles: int, along: float, size_px: int) -> Case:
+    """A view of the clumps, of a built-in scene or of a file, at a share `along` of its path.
 
     All triangles that are not blended cast, masked ones as if they were solid. The samples of the clumps are all
     tested, as by the rays that they are compared with, elsewhere those that face the light.
@@ -85,6 +85,7 @@ def read_case(scene_name: str, cameras: str | None, n_triangles: int, frame: int
     path = load_cameras(Path(cameras)) if cameras else scene.cameras
     if path is None:
         raise SystemExit(f"{scene_name}: has no cameras; give --cameras FILE.")
+    frame = int(along * len(path.poses))
     samples = trace_view_samples(scene, at_size(path.camera(frame), size_px))
     low, high = scene.bounds_m
     in_scene = ShadowLight(tuple(low + (high - low) * np.array([0.45, 0.8, 0.55])))

@@ -1,11 +1,11 @@
 """What the papers of 2011 and 2014 say of their shadow algorithms, counted again.
 
 python -m benchmarks.shadow_claims --out DIR [--scene BUILT_IN|FILE] [--triangles 60000] [--cameras FILE]
-    [--frames 0,20,40] [--size 1024] [--small 256] [--minutes 20]
+    [--frames 3] [--size 1024] [--small 256] [--minutes 20]
 
 Counts alone: they are the same on every device. Growth is from `small` to `size`; the papers' is from 1024 to 4096
-squared, 16 times the samples too. Tiles of 8 pixels and 32 children, as the papers. The frames are those of the path;
-all but the last claim are of the first one. What finds no time left is a line of the table too.
+squared, 16 times the samples too. Tiles of 8 pixels and 32 children, as the papers. Frames lie evenly on the path; all
+but the last claim are of the first one. What finds no time left is a line of the table too.
 """
 
 from __future__ import annotations
@@ -102,21 +102,21 @@ def main() -> None:
     parser.add_argument("--scene", default="grove")
     parser.add_argument("--triangles", type=int, default=60_000)
     parser.add_argument("--cameras")
-    parser.add_argument("--frames", default="0,20,40")
+    parser.add_argument("--frames", type=int, default=3)
     parser.add_argument("--size", type=int, default=1024)
     parser.add_argument("--small", type=int, default=256)
     parser.add_argument("--minutes", type=float, default=20.0)
     given = parser.parse_args()
     end = time.monotonic() + 60 * given.minutes
     keep_compiled_programs()
-    frames = [int(frame) for frame in given.frames.split(",")]
 
-    def case_of(frame: int, size: int) -> Case:
-        return read_case(given.scene, given.cameras, given.triangles, frame, size)
+    def case_of(share: float, size: int) -> Case:
+        return read_case(given.scene, given.cameras, given.triangles, share, size)
 
-    cases = {"first": case_of(frames[0], given.size), "small": case_of(frames[0], given.small)}
-    cases |= {f"frame {frame}": case_of(frame, given.size) for frame in frames[1:]}
-    on_path = [CLUSTERS, *(of(CLUSTERS, case=f"frame {frame}") for frame in frames[1:])]
+    cases = {"first": case_of(0.0, given.size), "small": case_of(0.0, given.small)}
+    shares = {f"{k} of {given.frames}": k / given.frames for k in range(1, given.frames)}
+    cases |= {name: case_of(share, given.size) for name, share in shares.items()}
+    on_path = [CLUSTERS, *(of(CLUSTERS, case=name) for name in shares)]
     counts: dict[Run, dict[str, float]] = {}
     record = {"scene": cases["first"].name, "claims": []}
     out = given.out / f"shadow-claims-{cases['first'].name.split(' (')[0].replace(' ', '-')}.json"

@@ -1,7 +1,7 @@
 """Shadow techniques against branching, tile size and Embree: time, tests and errors of every variant.
 
 python -m benchmarks.shadows --out DIR [--scene clumps|BUILT_IN|FILE] [--triangles 60000]
-    [--cameras FILE] [--frame 0] [--size 1024] [--minutes 8] [--variants cross|all|quick] [--workers 1]
+    [--cameras FILE] [--along 0] [--size 1024] [--minutes 8] [--variants cross|all|quick] [--workers 1]
 
 One process; `workers` threads compile. With warp-lang 1.19 installed and a GPU, its shadow rays run beside. A
 configuration that fails, or for which no time is left, is a line of the table too. Each program runs
@@ -137,7 +137,7 @@ def main() -> None:
     parser.add_argument("--scene", default="clumps")
     parser.add_argument("--triangles", type=int, default=60_000)
     parser.add_argument("--cameras")
-    parser.add_argument("--frame", type=int, default=0)
+    parser.add_argument("--along", type=float, default=0.0)
     parser.add_argument("--size", type=int, default=1024)
     parser.add_argument("--minutes", type=float, default=8.0)
     parser.add_argument("--variants", choices=("cross", "all", "quick"), default="cross")
@@ -145,7 +145,7 @@ def main() -> None:
     arguments = parser.parse_args()
     end = time.monotonic() + 60 * arguments.minutes
     keep_compiled_programs()
-    case = read_case(arguments.scene, arguments.cameras, arguments.triangles, arguments.frame, arguments.size)
+    case = read_case(arguments.scene, arguments.cameras, arguments.triangles, arguments.along, arguments.size)
     rays, by_rays = embree(case)
     record = {"scene": case.name, "device": device_name(), "versions": versions(), "embree": rays, "results": []}
     print(f"{case.name}, {device_name()}: {rays['rays']:,} samples, {by_rays.mean():.1%} in shadow", flush=True)
