@@ -379,6 +379,8 @@ def real_case(frame: int):
         ("cluster_hierarchy", ShadowPlan(4, 32, batch=2**14)),
         ("ptsv", ShadowPlan(8, 32, extra="silhouette")),
         ("ptsv", ShadowPlan(5, 16, extra="off", feedback=False)),
+        ("cluster_hierarchy", ShadowPlan(8, 16, passes=2, tree="full", batch=2**14)),
+        ("ptsv", ShadowPlan(8, 2, passes=2, level=5)),
     ],
     ids=str,
 )

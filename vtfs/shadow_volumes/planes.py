@@ -333,36 +333,26 @@ Planes = TypeVar("Planes", EdgePlanes, NodePlanes)
 
 
 class PlaneTable(eqx.Module, Generic[Planes]):
-    """All planes as one array, so that a single gather loads those of some triangles.
+    """All planes as one array, a row a triangle: a gather loads what lies together."""
 
-    On a CPU components are apart, as vectors are made of many triangles; elsewhere a triangle's lie side by side.
-    """
-
-    values: Float[Array, "*rows"]
+    values: Float[Array, "n components"]
     layout: Planes = eqx.field(static=True)
 
     def at(self, triangle: Int[Array, "*n"]) -> Planes:
         """The planes of some triangles."""
         leaves, structure = jax.tree.flatten(self.layout)
-        if _are_side_by_side():
-            rows = jnp.moveaxis(self.values.at[triangle].get(mode="promise_in_bounds"), -1, 0)
-        else:
-            rows = self.values.at[:, triangle].get(mode="promise_in_bounds")
-        return jax.tree.unflatten(structure, [row.astype(leaf.dtype) for row, leaf in zip(rows, leaves, strict=True)])
-
-
-def _are_side_by_side() -> bool:
-    return jax.default_backend() != "cpu"
+        columns = jnp.moveaxis(self.values.at[triangle].get(mode="promise_in_bounds"), -1, 0)
+        return jax.tree.unflatten(
+            structure, [column.astype(leaf.dtype) for column, leaf in zip(columns, leaves, strict=True)]
+        )
 
 
 def plane_table(planes: Planes) -> PlaneTable[Planes]:
     leaves, structure = jax.tree.flatten(planes)
     layout = jax.tree.unflatten(structure, [_Dtype(leaf.dtype) for leaf in leaves])
-    values = jnp.stack([leaf.astype(leaves[0].dtype) for leaf in leaves])
-    if _are_side_by_side():
-        # Two kernels that write what lies together: stacked the other way, each write would be on its own.
-        values = jax.lax.optimization_barrier(values).T
-    return PlaneTable(values, layout)
+    columns = jnp.stack([leaf.astype(leaves[0].dtype) for leaf in leaves])
+    # Stacked and turned, two sweeps in order: stacked as rows, every number would be written by itself.
+    return PlaneTable(jax.lax.optimization_barrier(columns).T, layout)
 
 
 @dataclass(frozen=True)
