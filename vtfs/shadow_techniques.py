@@ -104,12 +104,19 @@ def _rounded_up(name: str, needed: int, first: int) -> int:
     return max(first, 1 << (max(needed, 1) - 1).bit_length())
 
 
-def fitted(technique: str, plan: ShadowPlan, frame: ShadowFrame, unrolled: bool | None = None) -> ShadowPlan:
+def fitted(
+    technique: str,
+    plan: ShadowPlan,
+    frame: ShadowFrame,
+    unrolled: bool | None = None,
+    run: Callable[[str, ShadowPlan, ShadowFrame], ShadowMask] = run_program,
+) -> ShadowPlan:
     """The plan with capacities that hold a frame, found by running it.
 
     **Arguments:**
 
     - `unrolled`: without loops, each level with its own capacity; unless given, where the device is no CPU.
+    - `run`: the program to fit, if it is another one over the same tree.
     """
     n_samples = int(np.prod(frame.receives.shape))
     plan = replace(
@@ -120,7 +127,7 @@ def fitted(technique: str, plan: ShadowPlan, frame: ShadowFrame, unrolled: bool 
         level_groups=(),
     )
     while True:
-        mask = run_program(technique, plan, frame)
+        mask = run(technique, plan, frame)
         needed = np.asarray(mask.counts.groups).astype(np.int64)
         if not bool(mask.overflowed):
             break

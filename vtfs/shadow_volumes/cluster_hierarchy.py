@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
 from vtfs.shadow_volumes.sample_tiles import relative_boxes, sample_clusters, sample_tiles
-from vtfs.shadow_volumes.walk import mask_of, node_table, volumes, walk_volumes
+from vtfs.shadow_volumes.walk import SampleTree, Volumes, mask_of_tree, node_table, volumes, walk_volumes
 
 
 def cluster_hierarchy(frame: ShadowFrame, plan: ShadowPlan) -> ShadowMask:
@@ -14,13 +14,19 @@ def cluster_hierarchy(frame: ShadowFrame, plan: ShadowPlan) -> ShadowMask:
 
     At a leaf all samples of the tile are tested, as in the paper, also those of its other clusters.
     """
+    volume = volumes(frame, plan, about_light=not frame.directional)
+    tree = cluster_tree(frame, plan, volume)
+    walked = walk_volumes(volume, tree.table, tree.samples, tree.tile_of_item, False, plan)
+    return mask_of_tree(walked, volume.safe, tree)
+
+
+def cluster_tree(frame: ShadowFrame, plan: ShadowPlan, volume: Volumes) -> SampleTree:
+    """The tree over the occupied clusters of a frame, relative to what the volumes are."""
     samples = sample_tiles(frame.positions, frame.receives, plan.tile_px)
     clusters = sample_clusters(samples, frame.grid, plan.bounds == "explicit", plan.clusters)
-    volume = volumes(frame, plan, about_light=not frame.directional)
     table = node_table(relative_boxes(clusters.box, volume.origin_m), plan.branching, is_frustum=False)
-    walked = walk_volumes(volume, table, samples, clusters.tile, False, plan)
     in_tile = jnp.sum(samples.receives, axis=1, dtype=jnp.int32)[clusters.tile]
-    return mask_of(
-        walked, volume.safe, samples, clusters.of_sample, in_tile, clusters.n_samples, clusters.n_clusters,
-        clusters.n_blocks, clusters.n_blocks > plan.clusters,
+    return SampleTree(
+        samples, table, clusters.tile, clusters.of_sample, in_tile, clusters.n_samples, clusters.n_clusters,
+        clusters.n_blocks, clusters.n_blocks > plan.clusters, False,
     )  # fmt: skip

@@ -118,6 +118,27 @@ def node_table(items: Aabb, branching: int, is_frustum: bool) -> NodeTable:
     return NodeTable(row, n_children, jnp.stack(n_below), levels)
 
 
+class SampleTree(eqx.Module):
+    """View samples and the tree above them: what a technique walks.
+
+    - `table`: its nodes; `tile_of_item`: of each tile or cluster that is a leaf; `item_of_sample`: which leaf a sample
+      is in.
+    - `n_in_tile`, `n_in_item`: samples that receive shadow, of each item's tile and of the item itself.
+    - `n_items`, `n_blocks`: as in `ShadowCounts`; `overflowed`: of the tree.
+    """
+
+    samples: SampleTiles
+    table: NodeTable
+    tile_of_item: Int[Array, " items"]
+    item_of_sample: Int[Array, "tiles lanes"]
+    n_in_tile: Int[Array, " items"]
+    n_in_item: Int[Array, " items"]
+    n_items: Int[Array, ""]
+    n_blocks: Int[Array, ""]
+    overflowed: Bool[Array, ""]
+    is_frustum: bool = eqx.field(static=True)
+
+
 class Walk(eqx.Module):
     """What a walk found; counts as in `ShadowCounts`.
 
@@ -153,7 +174,7 @@ def walk_volumes(
     batch = plan.batch if 0 < plan.batch < n_triangles else n_triangles
     n_nodes = sum(table.level_nodes[1:]) + table.level_nodes[-1] * plan.branching
     n_levels = len(table.level_nodes)
-    sample_rows = _sample_rows(samples, volume)
+    sample_rows = rows_of_samples(samples, volume)
     none = jnp.zeros(n_nodes, bool)
 
     def walk_batch(first, before: Array, bits: Array):
@@ -343,7 +364,7 @@ def _to_leaves(
     return lists, shadowed, cover, (node_tests, accepted, refined, extra, groups_needed)
 
 
-def _sample_rows(samples: SampleTiles, volume: Volumes) -> Float[Array, "tiles 4 lanes"]:
+def rows_of_samples(samples: SampleTiles, volume: Volumes) -> Float[Array, "tiles 4 lanes"]:
     """Position of each sample of a tile, and its bias over its distance to the light."""
     position = [samples.x_m, samples.y_m, samples.z_m]
     x, y, z = (c.astype(jnp.float64) - o for c, o in zip(position, volume.origin_m, strict=True))
@@ -444,6 +465,22 @@ def count_volumes(
     return total, Walk(none, node_tests, accepted, refined, extra, groups, leaves.count[:n_items], overflowed)
 
 
+def leaf_lists(volume: Volumes, tree: SampleTree, plan: ShadowPlan) -> tuple[NodeLists, Walk]:
+    """The triangles that each item's samples are to be tested against where no node may be accepted as a whole; the
+    walk's own bits are empty."""
+    n_triangles, n_items = volume.safe.shape[0], tree.tile_of_item.shape[0]
+    levels = tree.table.level_nodes
+    before = jnp.zeros(sum(levels[1:]) + levels[-1] * plan.branching, bool)
+    # No node lies farther behind a triangle than infinity.
+    unaccepting = eqx.tree_at(lambda v: v.bias_m, volume, jnp.full_like(volume.bias_m, jnp.inf))
+    root = one_list(volume.safe, LANES, n_triangles)
+    leaves, _, _, counted = _to_leaves(root, before, unaccepting, tree.table, tree.is_frustum, plan, n_triangles)
+    node_tests, accepted, refined, extra, groups = counted
+    overflowed = leaves.overflowed | _too_many(groups[:-1], plan)
+    none = jnp.zeros((n_items, max(1, tree.samples.z_m.shape[1] // 32)), jnp.uint32)
+    return leaves, Walk(none, node_tests, accepted, refined, extra, groups, leaves.count[:n_items], overflowed)
+
+
 def _merged(
     bits: UInt32[Array, "groups words"], start: Int[Array, " items_and_1"], n_items: int
 ) -> UInt32[Array, "items words"]:
@@ -511,3 +548,11 @@ def mask_of(
     )
     view = samples.viewport, samples.tile_px
     return ShadowMask(in_runs(shadowed, *view), walked.overflowed | overflowed, in_runs(tests, *view), counts)
+
+
+def mask_of_tree(walked: Walk, casts: Bool[Array, " triangles"], tree: SampleTree) -> ShadowMask:
+    """The same for a tree."""
+    return mask_of(
+        walked, casts, tree.samples, tree.item_of_sample, tree.n_in_tile, tree.n_in_item, tree.n_items, tree.n_blocks,
+        tree.overflowed,
+    )  # fmt: skip
