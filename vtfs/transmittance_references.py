@@ -20,8 +20,8 @@ class ReferenceLight:
     """What alpha casters leave of a light at some points.
 
     - `transmittance`: float64 `[n]`, or `[n, 3]` where blending is coloured.
-    - `cutoff_margin`: how far the alpha of the nearest decision lies from its cutoff, `[n]`; infinite without one. Below
-      some roundings either answer is right.
+    - `cutoff_margin`: how far the alpha of the nearest decision lies from its cutoff, `[n]`; infinite without one.
+      Below some roundings either answer is right.
     """
 
     transmittance: np.ndarray
@@ -66,8 +66,9 @@ def brute_force_transmittance(
         distance = np.where(masked, np.abs(alpha - casters.cutoff[triangle]), np.inf)
         if blending == "stochastic":
             assert pixel is not None
-            words = (pixel[first + point].astype(np.uint32), casters.number[triangle], *np.uint32(stream))
-            random = random_words(*words) / 2.0**32
+            seed, view = np.array(stream, np.uint32)[:, None]  # arrays wrap in silence, numbers do not
+            word = random_words(pixel[first + point].astype(np.uint32), casters.number[triangle], seed, view)
+            random = word / 2.0**32
             stops |= ~masked & (random < alpha)
             distance = np.where(masked, distance, np.abs(random - alpha))
         blended = np.where(masked | (blending == "stochastic"), 0.0, alpha)
@@ -93,7 +94,7 @@ def _alpha_met(
     # Areas of the three parts of the triangle around the place, over its own.
     area = (normal * normal).sum(axis=1)
     weight = [(np.cross(q - p, at - p) * normal).sum(axis=1) / area for p, q in ((b, c), (c, a), (a, b))]
-    uv = sum(w[:, None] * casters.uv[t, k] for k, w in enumerate(weight))
+    uv = np.sum([w[:, None] * casters.uv[t, k] for k, w in enumerate(weight)], axis=0)
     for i, image in enumerate(casters.images):
         here = casters.image[t] == i
         alpha[textured[here]] *= bilinear(image, uv[here, 0], uv[here, 1])
