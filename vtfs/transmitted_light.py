@@ -15,7 +15,7 @@ from vtfs.alpha_casters import AlphaSurfaces, Blending, SceneCasters, alpha_on_d
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight
-from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan, casters_on_device, shadow_frame
+from vtfs.shadow_mask import ShadowFrame, ShadowPlan, casters_on_device, shadow_frame
 from vtfs.shadow_techniques import CastShadows, cast_shadows, fitted, on_host, shadow_grid
 from vtfs.shadow_volumes.transmittance import Transmitted, transmit
 from vtfs.view_samples import ViewSamples
@@ -102,15 +102,13 @@ def transmitted_light(
     surfaces = alpha_on_device(casters.alpha)
     words = np.array(stream, np.uint32)
 
-    def found(technique: str, plan: ShadowPlan, frame: ShadowFrame) -> Transmitted:
+    @functools.cache  # what the sizing run found is not found again
+    def found(plan: ShadowPlan) -> Transmitted:
         with jax.enable_x64(True):
             return alpha_program(technique, plan, blending)(frame, surfaces, jnp.asarray(words))
 
-    def mask_alone(technique: str, plan: ShadowPlan, frame: ShadowFrame) -> ShadowMask:
-        return found(technique, plan, frame).mask
-
-    plan = fitted(technique, plan, frame, run=mask_alone)
-    transmitted = found(technique, plan, frame)
+    plan = fitted(technique, plan, frame, run=lambda _technique, plan, _frame: found(plan).mask)
+    transmitted = found(plan)
     alpha = on_host(transmitted.mask, plan, frame)
     stopped = opaque.shadowed | alpha.shadowed
     if blending == "stochastic":

@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull
 from tests.strategies import SMALL, a_camera, seeds, surface_samples
 from tests.vtfs.test_shadow_mask import CLUSTERS, N_TRIANGLES, N_VERTICES, TILES, light_of, soup
 from vtfs.alpha_casters import AlphaCasters, Blending, alpha_on_device, scene_casters
-from vtfs.camera import Viewport
+from vtfs.camera import Camera, Viewport
 from vtfs.gallery import build_scene
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
