@@ -25,7 +25,7 @@ from tuning.record import append_measurement, read_measurements
 from tuning.select import fit_models, fit_stage
 from tuning.space import Space, accuracy_values
 from vtfs.input_error import InputError
-from vtfs.parameters import PARAMETERS, Configuration, configuration
+from vtfs.parameters import Configuration, configuration
 
 HOPELESS = 12
 """A technique whose default needs this many times the lighting computations of the thriftiest is not measured."""
@@ -183,7 +183,7 @@ def search(
             break
         in_budget = all(run.measure(candidate, share) for candidate in choice.configurations)
 
-    exact = run.fastest(candidate for candidate in run.measured if candidate in hopeful and _is_exact(candidate))
+    exact = run.fastest(candidate for candidate in run.measured if candidate in hopeful and candidate.is_exact)
     if exact is not None:
         for candidate in _less_accurate(exact):
             if not run.measure(candidate):
@@ -290,9 +290,9 @@ class _Run:
     def _is_allowed(self, candidate: Configuration) -> bool:
         """May it be recommended? What may not, as a default that the space leaves out, is not there to be beaten."""
         if self._max_error is None:
-            return candidate in self._space and _is_exact(candidate)
+            return candidate in self._space and candidate.is_exact
         error = self.measured[candidate].error
-        known = candidate in self._space or _exact(candidate) in self._space
+        known = candidate in self._space or candidate.exact() in self._space
         return known and error is not None and error <= self._max_error
 
     def timed(self, candidate: Configuration) -> Measurement | None:
@@ -305,7 +305,7 @@ class _Run:
 
     def best(self, space: Space, max_error: float | None) -> Configuration:
         """The fastest that may be recommended."""
-        timed = {c: m for c in self.measured if (c in space or _exact(c) in space) and (m := self.timed(c)) is not None}
+        timed = {c: m for c in self.measured if (c in space or c.exact() in space) and (m := self.timed(c)) is not None}
         if not timed:
             outcomes = ", ".join(sorted({measurement.outcome for measurement in self.measured.values()}))
             message = next((f": {m.message}" for m in self.measured.values() if m.message), "")
@@ -314,7 +314,7 @@ class _Run:
                 "try a smaller size, a larger budget, other techniques or another space."
             )
         if max_error is None:
-            found = self.fastest(filter(_is_exact, timed))
+            found = self.fastest(c for c in timed if c.is_exact)
             if found is None:
                 raise InputError("max-error is missing and no exact setting could be timed; say what error is allowed.")
             return found
@@ -385,18 +385,8 @@ def _explored(space: Space, run: _Run) -> tuple[Space, dict[str, str]]:
 
 
 def _less_accurate(exact: Configuration) -> list[Configuration]:
-    settings = ({"gbuffer": gbuffer, "light_cutoff": cutoff} for gbuffer, cutoff in accuracy_values())
-    changed = [{k: v for k, v in setting.items() if k in exact.params} for setting in settings]
+    changed = [{k: v for k, v in setting.items() if k in exact.params} for setting in accuracy_values()]
     return [c for c in dict.fromkeys(exact.replaced(**change) for change in changed) if c != exact]
-
-
-def _exact(candidate: Configuration) -> Configuration:
-    names = [name for name in ("gbuffer", "light_cutoff") if name in candidate.params]
-    return candidate.replaced(**{name: PARAMETERS[name].default for name in names})
-
-
-def _is_exact(candidate: Configuration) -> bool:
-    return candidate == _exact(candidate)
 
 
 def _measurement(run: _Run, candidate: Configuration | None) -> Measurement | None:

@@ -15,13 +15,13 @@ import numpy as np
 from tuning.choose import Objective, is_timed, median_interval, time_interval_ms, time_ms
 from tuning.compiles import watch_compiles
 from tuning.measurement import Measurement
+from tuning.run_pictures import draw
 from tuning.space import Space, default_space
 from tuning.sweep import Budget, Progress, SearchResult, search
 from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_counts
 from vtfs.device import versions
 from vtfs.files import write_atomically
 from vtfs.frame import FrameInputs
-from vtfs.image import exposure, heat_map, tone_map, write_png
 from vtfs.parameters import Configuration, configuration
 from vtfs.scene_setup import SceneSetup
 
@@ -82,7 +82,7 @@ def tune(
     tell("comparing the best with the defaults, in turns")
     gain, times = _duel(workload, found, options.objective)
     tell("drawing")
-    pictures = _pictures(workload, found, options.out / "pictures")
+    drawn = draw(workload, found, options.out / "pictures")
     compared = [m for m in found.measurements if is_timed(m)]
     result = {
         "schema": 1,
@@ -130,7 +130,8 @@ def tune(
             name: dict(counts[0]) for name in space.techniques if (counts := workload.counts(configuration(name)))
         },
         "stages": _stages(found, options.objective),
-        "pictures": pictures,
+        "pictures": drawn.pictures,
+        "list_lengths": drawn.list_lengths,
     }
     result |= {
         "compiled_programs": compiles.programs,
@@ -152,7 +153,7 @@ def choose_frames(setup: SceneSetup) -> tuple[int, ...]:
 
 
 def _inputs(setup: SceneSetup, frame: int) -> FrameInputs:
-    return FrameInputs(setup.samples(frame), setup.lights)
+    return setup.inputs(frame)
 
 
 def _config(measurement: Measurement) -> Configuration:
@@ -197,48 +198,8 @@ def _stages(found: SearchResult, objective: Objective) -> dict[str, dict[str, fl
     stages: dict[str, dict[str, float]] = {}
     fastest: dict[str, Measurement] = {}
     for m in found.measurements:
-        exact = m.params.get("gbuffer") == "float32" and m.params.get("light_cutoff") == 0
-        if is_timed(m) and exact:
+        if is_timed(m) and _config(m).is_exact:
             fastest[m.technique] = min(fastest.get(m.technique, m), m, key=lambda m: time_ms(m, objective))
     for technique, m in fastest.items():
         stages[technique] = {name: float(np.median(frames[0])) for name, frames in m.stages_ms.items()}
     return stages
-
-
-def _pictures(workload: SceneWorkload, found: SearchResult, folder: Path) -> list[dict[str, Any]]:
-    """The best configuration's image, and heat maps of lighting computations on one scale."""
-    valid = workload.valid()
-    image = workload.image(_config(found.best))
-    write_png(folder / "frame.png", tone_map(image, exposure(image, valid)))
-    frame = workload.frames[0]
-    pictures: list[dict[str, Any]] = [
-        {
-            "file": "frame.png",
-            "kind": "frame",
-            "technique": found.best.technique,
-            "caption": f"Frame {frame}, the one with the most lighting computations, "
-            f"as {found.best.technique} renders it.",
-        }
-    ]
-    fastest: dict[str, Measurement] = {}
-    for m in found.measurements:
-        if is_timed(m) and m.params.get("light_cutoff") == 0:
-            fastest[m.technique] = min(fastest.get(m.technique, m), m, key=lambda m: time_ms(m, "max"))
-    lengths = {technique: workload.list_lengths(_config(m)) for technique, m in fastest.items()}
-    listed = {technique: own for technique, own in lengths.items() if technique != "forward"}
-    largest = max((int(own.max(initial=0)) for own in (listed or lengths).values()), default=0)
-    for technique, own in lengths.items():
-        name = f"heat_{technique}.png"
-        write_png(folder / name, heat_map(own, largest, valid))
-        pictures.append(
-            {
-                "file": name,
-                "kind": "heat_map",
-                "technique": technique,
-                "caption": f"Lighting computations per pixel, {_config(fastest[technique])}.",
-                "max_count": int(own.max(initial=0)),
-                "mean_count": float(own[valid].mean()) if valid.any() else 0.0,
-                "scale_max": largest,
-            }
-        )
-    return pictures

@@ -16,8 +16,10 @@ import numpy as np
 from tuning.choose import Objective, median_interval
 from tuning.compiles import Compiles
 from tuning.measurement import Measurement, Outcome
+from tuning.shadow_check import MaskCheck, ShadowChecker, masks_on_host
 from tuning.timing import interleaved_ms, repeats_ms, timed_ms
 from vtfs.cache import cached
+from vtfs.cell_maps import CellMaps, cell_maps
 from vtfs.device import device_name, versions
 from vtfs.frame import (
     NO_SIZES,
@@ -25,6 +27,7 @@ from vtfs.frame import (
     FrameCounts,
     FrameInputs,
     Sizes,
+    cast_program,
     count,
     frame_program,
     image_on_host,
@@ -36,9 +39,10 @@ from vtfs.frame import (
 )
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
-from vtfs.op_counts import OpCounts
-from vtfs.parameters import Configuration, configuration
+from vtfs.op_counts import ListLengths, OpCounts
+from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration
 from vtfs.reference import forward_reference, image_error
+from vtfs.shadow_inputs import ShadowScene
 from vtfs.techniques import REGISTRY
 from vtfs.view_samples import ViewSamples
 
@@ -69,6 +73,7 @@ class ScenePath:
     samples: tuple[ViewSamples, ...]
     lights: Lights
     seed: int
+    shadow_scene: ShadowScene | None = None
 
 
 class SceneWorkload:
@@ -78,8 +83,12 @@ class SceneWorkload:
         self._path = path
         self._compiles = compiles
         self._objective = objective
-        self._inputs = [FrameInputs(samples, path.lights) for samples in path.samples]
+        self._inputs = [
+            FrameInputs(samples, path.lights, frame, shadow_scene=path.shadow_scene)
+            for samples, frame in zip(path.samples, path.frames, strict=True)
+        ]
         self._reference: np.ndarray | None = None
+        self._checker: ShadowChecker | None = None
         self._counted: dict[tuple[Configuration, int], FrameCounts] = {}
         self.device = device_name()
         self.frames = path.frames
@@ -94,13 +103,12 @@ class SceneWorkload:
             return ()
 
     def counts_of_frame(self, config: Configuration, i: int) -> OpCounts:
-        # Counting is done once for all batches: they change no list.
-        canonical = config.replaced(batch=0)
+        canonical = counted_configuration(config)
         if (canonical, i) not in self._counted:
             self._counted[canonical, i] = cached_counts(
                 canonical, self.scene_key, self.frames[i], lambda: self._inputs[i]
             )
-        return self._counted[canonical, i].at_batch(int(config["batch"]))
+        return self._counted[canonical, i].of(config)
 
     def measure(self, config: Configuration, best_ms: float | None, /) -> Measurement:
         """Check a configuration against the float64 reference, then time its frame and its stages."""
@@ -150,12 +158,20 @@ class SceneWorkload:
         """Which pixels of that frame have a sample."""
         return self._inputs[0].seen()
 
-    def list_lengths(self, config: Configuration) -> np.ndarray:
-        """Lights listed for each pixel of that frame."""
-        return count(config, self._inputs[0])[1].of_sample
+    def solid(self) -> np.ndarray:
+        """Which of them have a solid one."""
+        return self._inputs[0].samples.valid
+
+    def list_lengths(self, config: Configuration) -> ListLengths:
+        """Lights listed for each pixel and each cell of that frame."""
+        return count(config, self._inputs[0])[1]
+
+    def cell_maps(self, config: Configuration) -> CellMaps | None:
+        """The cells of that frame; None where the technique has none."""
+        return cell_maps(config, self._inputs[0])
 
     def reference(self) -> np.ndarray:
-        """The float64 image of the frame with the most work."""
+        """The float64 image of the frame with the most work, without shadows."""
         if self._reference is None:
             samples, lights = self._path.samples[0], self._path.lights
             parts = (self.scene_key, f"frame {self.frames[0]}")
@@ -178,10 +194,16 @@ class SceneWorkload:
         if bool(overflowed):
             return "overflow", "a frame no longer fits the capacities that its sizing run found"
         valid = self._inputs[0].seen()
+        if REGISTRY[config.technique].casts_shadows:
+            checked = self._check_masks(config)
+            reference = checked.image
+            if checked.wrong and not changes_shadows(config):
+                return "failed", checked.wrong
+        else:
+            reference = self.reference()
         with np.errstate(invalid="ignore", over="ignore"):  # of an image that overflowed the error is infinite
-            taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), self.reference(), valid)
-        exact = config["gbuffer"] == "float32" and config["light_cutoff"] == 0
-        if exact and not taken.error <= EXACT_ERROR:
+            taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), reference, valid)
+        if config.is_exact and not taken.error <= EXACT_ERROR:
             return "failed", f"error {taken.error:.2g} against the float64 reference; float32 explains {EXACT_ERROR:g}"
         # The first run's time may be the compiler's: only a second one is held against the configuration.
         slow = time.perf_counter() - started > TIMEOUT_S
@@ -212,6 +234,14 @@ class SceneWorkload:
         taken.stages_ms = self._stages_ms(config, sizes, env) | {"frame": tuple(frames)}
         return "timed", ""
 
+    def _check_masks(self, config: Configuration) -> MaskCheck:
+        samples, shadows = self._path.samples[0], self._inputs[0].shadows
+        if self._checker is None:
+            key = (self.scene_key, f"frame {self.frames[0]}")
+            self._checker = ShadowChecker(shadows, samples, self._path.lights, key)
+        masks = cast_program(config.technique, planned(config, self._sizes_of(config)))(shadows.tasks(config))
+        return self._checker.check(config, masks_on_host(masks, samples))
+
     def _stages_ms(
         self, config: Configuration, sizes: Sizes, env: dict[str, Any]
     ) -> dict[str, tuple[tuple[float, ...], ...]]:
@@ -219,7 +249,8 @@ class SceneWorkload:
 
         None where `env` is empty: of what has lost, and where the frame is one stage.
         """
-        stages = REGISTRY[config.technique].stages_of(self._inputs[0].has_transparent) if env else ()
+        technique = REGISTRY[config.technique]
+        stages = technique.stages_of(technique.plan(config), self._inputs[0].has_transparent) if env else ()
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:
@@ -238,7 +269,7 @@ class SceneWorkload:
             return NO_SIZES
         for i in range(len(self._inputs)):
             self.counts_of_frame(config, i)
-        canonical = config.replaced(batch=0)
+        canonical = counted_configuration(config)
         sizes = NO_SIZES
         for i in range(len(self._inputs)):
             sizes = sizes.covering(self._counted[canonical, i].sizes)

@@ -10,7 +10,7 @@ import numpy as np
 from vtfs.frame import FrameInputs, lengths_of, run_stages
 from vtfs.gbuffer import from_runs
 from vtfs.light_volumes import lights_of_samples
-from vtfs.parameters import Configuration, configuration
+from vtfs.parameters import Configuration, configuration, lists_configuration
 from vtfs.techniques import REGISTRY
 
 
@@ -43,6 +43,7 @@ def cell_maps(config: Configuration, inputs: FrameInputs) -> CellMaps | None:
     """The maps of a technique that shades by cells; None for the others."""
     if REGISTRY[config.technique].lists != "clusters":
         return None
+    config = lists_configuration(config)
     env, _ = run_stages(config, inputs, until="assign")
     clusters, positions, grid = env["clusters"], env["positions"], env["grid"]
     visible = np.s_[: positions.n_visible_runs]

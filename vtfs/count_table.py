@@ -7,9 +7,9 @@ import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from vtfs.frame import FrameCounts, FrameInputs, count
+from vtfs.frame import FrameCounts, count
 from vtfs.op_counts import OpCounts
-from vtfs.parameters import Configuration
+from vtfs.parameters import Configuration, counted_configuration
 from vtfs.scene_setup import SceneSetup
 
 
@@ -29,14 +29,13 @@ def count_frames(
     """Exact counts of every configuration on every frame, frame by frame (samples are traced once)."""
     rows: list[CountRow] = []
     for frame in frames:
-        inputs = FrameInputs(setup.samples(frame), setup.lights)
+        inputs = setup.inputs(frame)
         counted: dict[Configuration, FrameCounts] = {}
         for config in configs:
-            # A batch changes how the work is cut up, not the lists.
-            canonical = config.replaced(batch=0)
+            canonical = counted_configuration(config)
             if canonical not in counted:
                 counted[canonical] = count(canonical, inputs)[0]
-            rows.append(CountRow(config, frame, counted[canonical].at_batch(int(config["batch"]))))
+            rows.append(CountRow(config, frame, counted[canonical].of(config)))
             progress(len(rows), len(frames) * len(configs))
     return rows
 
@@ -68,6 +67,11 @@ def print_counts(rows: Sequence[CountRow]) -> None:
         "divergence",
         "tree_tests",
         "leaf_tests",
+        "shadow_lights",
+        "test_and_set",
+        "extra_plane_tests",
+        "longest_shadow_list",
+        "memory",
     )
     names = [name for name in shown if any(name in row.counts for row in rows)]
     table = Table(box=None, pad_edge=False)

@@ -14,12 +14,17 @@ import numpy as np
 from vtfs.cluster_grid import cluster_grid, configured_grid, n_cells, n_keys, tile_and_slices
 from vtfs.gbuffer import RUN_WIDTH_PX, Fragments, GBuffer, LayerTable, Positions, from_runs
 from vtfs.input_error import InputError
-from vtfs.light_lists import view_lights
+from vtfs.light_assignment.brute_force import every_pair
+from vtfs.light_assignment.light_tree import reduce_lights, sort_lights
+from vtfs.light_lists import AssignCounts, ViewLights, view_lights
+from vtfs.light_shadows import CastMask
 from vtfs.lights import Lights
+from vtfs.morton import morton_codes
 from vtfs.op_counts import (
     ListLengths,
     OpCounts,
     added,
+    approximation_counts,
     assign_counts,
     batch_counts,
     cluster_counts,
@@ -32,12 +37,24 @@ from vtfs.op_counts import (
     uniform_lengths,
     walk_rows,
 )
-from vtfs.parameters import PARAMETERS, Configuration
-from vtfs.techniques import REGISTRY, Plan, Stage, volume_chunk, walk_chunk
+from vtfs.parameters import PARAMETERS, SHADOW_REFERENCES, Configuration, lists_configuration, shading_batch
+from vtfs.shadow_inputs import FrameShadows, ShadowScene, ShadowTask, receiving
+from vtfs.shadow_techniques import (
+    CastShadows,
+    fitted_to_all,
+    on_host,
+    shadow_plan,
+    shadow_sizes,
+    shadows_counts,
+    with_shadow_sizes,
+)
+from vtfs.techniques import REGISTRY, Plan, Stage, Walked, approximates, assign_chunk, volume_chunk
 from vtfs.view_samples import ViewSamples
 
 _BRUTE_FORCE_WORD = 32
-_NO_STRUCTURES = ("positions", "gbuffer", "normals", "grid", "light_cutoff")
+_NO_STRUCTURES = (
+    "positions", "gbuffer", "normals", "grid", "light_cutoff", "approximate", "frame", "resort_every",
+)  # fmt: skip
 
 
 class CapacityError(InputError):
@@ -52,14 +69,20 @@ class Sizes:
 
     - `cells`: of the grid's page table; `blocks`: of clusters and of their blocks; `pairs`: of the
       (cluster, light) pairs and of every level on the way to them.
+    - `shadow`: of shadow techniques, see `shadow_sizes`.
     """
 
     cells: int
     blocks: int
     pairs: int
+    shadow: tuple[int, ...] = ()
 
     def covering(self, other: Sizes) -> Sizes:
-        return Sizes(max(self.cells, other.cells), max(self.blocks, other.blocks), max(self.pairs, other.pairs))
+        """What holds both; of the same technique and plan."""
+        shadow = self.shadow or other.shadow
+        if self.shadow and other.shadow:
+            shadow = tuple(map(max, self.shadow, other.shadow))
+        return Sizes(max(self.cells, other.cells), max(self.blocks, other.blocks), max(self.pairs, other.pairs), shadow)
 
 
 NO_SIZES = Sizes(0, 0, 0)
@@ -84,10 +107,27 @@ def rounded_up(name: str, needed: int) -> int:
 
 
 class FrameInputs:
-    """One frame on the device: view samples and lights, uploaded once and used by every configuration."""
+    """One frame on the device: view samples and lights, uploaded once and used by every configuration.
 
-    def __init__(self, samples: ViewSamples, lights: Lights):
+    - `frame`: its number on the path: where `resort_every` divides it, the light tree is sorted.
+    - `earlier_lights`: where lights were in an earlier frame, in its view space; where they are now unless given.
+    - `shadow_scene`: what casts shadows, for shadow techniques.
+    """
+
+    def __init__(
+        self,
+        samples: ViewSamples,
+        lights: Lights,
+        frame: int = 0,
+        earlier_lights: Callable[[int], ViewLights] | None = None,
+        shadow_scene: ShadowScene | None = None,
+    ):
+        self._shadow_scene = shadow_scene
+        self._lights = lights
         self.samples = samples
+        self.frame = frame
+        self._earlier_lights = earlier_lights
+        self._orders: dict[tuple[int, float], jax.Array] = {}
         self.camera = samples.camera
         self.viewport = samples.camera.viewport
         self.lights = view_lights(lights, samples.camera)
@@ -97,6 +137,16 @@ class FrameInputs:
         self._fragments: dict[bool, Fragments] = {}
         self._positions: dict[bool, Positions] = {}
         self._gbuffers: dict[tuple[bool, str], GBuffer] = {}
+
+    @cached_property
+    def shadows(self) -> FrameShadows:
+        """What casts on this frame.
+
+        **Raises:** `InputError` where there is no geometry, or no light that casts.
+        """
+        if self._shadow_scene is None:
+            raise InputError("shadow techniques need the triangles of a scene: give a scene file, not a G-buffer.")
+        return FrameShadows(self._shadow_scene, self.samples, self._lights)
 
     @cached_property
     def layers(self) -> LayerTable:
@@ -122,6 +172,13 @@ class FrameInputs:
             self._gbuffers[key] = self.fragments(with_hidden).gbuffer(self.positions(with_hidden), precision)
         return self._gbuffers[key]
 
+    def order_of(self, frame: int, light_cutoff: float) -> jax.Array:
+        """The lights in Morton order of an earlier frame: what that frame left for those after it."""
+        if (frame, light_cutoff) not in self._orders:
+            lights = self._earlier_lights(frame) if self._earlier_lights else self.lights
+            self._orders[frame, light_cutoff] = _morton_order(lights, np.float32(light_cutoff))
+        return self._orders[frame, light_cutoff]
+
     def seen(self) -> np.ndarray:
         """Which pixels show anything: bool `[h, w]`."""
         layers = [layer.samples.valid for layer in self.samples.layers.transparent]
@@ -129,7 +186,7 @@ class FrameInputs:
 
     def environment(self, config: Configuration) -> dict[str, Any]:
         """What the stages of a configuration start from, by the names that `Stage.needs` uses."""
-        params = config.params
+        params = lists_configuration(config).params
         technique = REGISTRY[config.technique]
         with_hidden = technique.shades_hidden(config)
         env: dict[str, Any] = {
@@ -138,26 +195,58 @@ class FrameInputs:
             "layers": self.layers,
             "lights": self.lights,
             "light_cutoff": np.float32(params["light_cutoff"]),
+            "approximate": np.float32(params.get("approximate", 0)),
+            "cluster_light": None,
         }
+        resort_every = int(params.get("resort_every", 1))
+        if resort_every > 1:
+            last_sorted = self.frame - self.frame % resort_every
+            env["old_order"] = self.order_of(last_sorted, float(params["light_cutoff"]))
+            env |= {"frame": np.int32(self.frame), "resort_every": np.int32(resort_every)}
         if technique.lists == "clusters":
             env["grid"] = configured_grid(self.camera, params, self.deepest_m, technique.one_slice)
             # Only where they are read: each precision of the G-buffer would compile the clusters again.
-            needs_normals = params.get("normal_bins", 0) or params.get("normal_cones", "implicit") == "explicit"
+            has_cones = technique.plan(config).normal_cones == "explicit"
+            needs_normals = has_cones or params.get("normal_bins", 0)
             env["normals"] = env["gbuffer"].normal if needs_normals else None
         elif technique.lists == "light_volumes":  # for its pixels
             env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
+        if technique.casts_shadows:
+            env["shadow_slots"] = self.shadows.slots
+            if config.technique in SHADOW_REFERENCES:
+                env["shadow_traverse"] = self.shadows.reference_masks(config)
+            else:
+                env["shadow_tasks"] = self.shadows.tasks(config)
         return env
+
+
+@jax.jit
+def _morton_order(lights: ViewLights, light_cutoff) -> jax.Array:
+    spheres = lights.spheres(light_cutoff)
+    return sort_lights(morton_codes(spheres, *reduce_lights(spheres)))
 
 
 def planned(config: Configuration, sizes: Sizes) -> Plan:
     plan = REGISTRY[config.technique].plan(config)
-    return replace(plan, cells=sizes.cells, blocks=sizes.blocks, pairs=sizes.pairs)
+    shadow = with_shadow_sizes(plan.shadow, sizes.shadow) if plan.shadow else None
+    return replace(plan, cells=sizes.cells, blocks=sizes.blocks, pairs=sizes.pairs, shadow=shadow)
 
 
 @functools.cache
 def stage_program(stage: Stage, plan: Plan) -> Callable[..., Any]:
     """One stage as a program of its own. `plan` holds only what the stage names: see `narrowed`."""
-    return jax.jit(functools.partial(stage.run, plan))
+    program = jax.jit(functools.partial(stage.run, plan))
+    return _for_each_shadow(program) if stage.per_shadow else program
+
+
+def _for_each_shadow(program: Callable[..., Any]) -> Callable[..., list[Any]]:
+    """Run for each light that casts and each view, in float64."""
+
+    def run(*lists: list[Any]) -> list[Any]:
+        with jax.enable_x64(True):
+            return [program(*each) for each in zip(*lists, strict=True)]
+
+    return run
 
 
 def narrowed(stage: Stage, plan: Plan) -> Plan:
@@ -167,16 +256,54 @@ def narrowed(stage: Stage, plan: Plan) -> Plan:
 
 def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
     """Add a stage's result to what later stages may need. An assignment's counts stay apart from its lists: their
-    shape depends on the tree, and would compile the shading again for every branching."""
+    shape depends on the tree, and would compile the shading again for every branching. What is evaluated once a
+    cluster leaves the lists."""
     if stage == "assign":
         env["assign"], env["assign_counts"] = result
+        env["listed"] = env["assign"]
+    elif stage == "approximate":
+        env["assign"], env["cluster_light"] = result
     else:
         env[stage] = result
 
 
 def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable[..., Any]:
-    """All stages fused in one program: from the inputs to the image and whether anything overflowed."""
-    return _fused(REGISTRY[technique].stages_of(has_transparent), plan)
+    """All stages fused: from the inputs to the image and whether anything overflowed.
+
+    One program; of shadow techniques two, as shadows are found in float64 and shaded in float32: `cast_program`, and
+    from its masks to the image.
+    """
+    stages = REGISTRY[technique].stages_of(plan, has_transparent)
+    casting = tuple(stage for stage in stages if stage.per_shadow)
+    image = _fused(tuple(stage for stage in stages if not stage.per_shadow), replace(plan, shadow=None))
+    if not casting:
+        return image
+    cast = cast_program(technique, plan)
+
+    def run(env: dict[str, Any]):
+        shading = {name: value for name, value in env.items() if name != "shadow_tasks"}
+        return image(shading | {casting[-1].name: cast(env["shadow_tasks"])})
+
+    return run
+
+
+def cast_program(technique: str, plan: Plan) -> Callable[[list[ShadowTask]], list[CastMask]]:
+    """From view samples to the mask of one light on one view, fused, and run for each of them."""
+    casting = tuple(stage for stage in REGISTRY[technique].stages if stage.per_shadow)
+    if len(casting) == 1:  # the same program: it is compiled once
+        return stage_program(casting[0], narrowed(casting[0], plan))
+    return _for_each_shadow(_fused_casting(casting, Plan(shadow=plan.shadow)))
+
+
+@functools.cache
+def _fused_casting(stages: tuple[Stage, ...], plan: Plan) -> Callable[[ShadowTask], CastMask]:
+    def run(task: ShadowTask) -> CastMask:
+        env: dict[str, Any] = {"shadow_tasks": task}
+        for stage in stages:
+            env[stage.name] = stage.run(plan, *(env[name] for name in stage.needs))
+        return env[stages[-1].name]
+
+    return jax.jit(run)
 
 
 @functools.cache
@@ -186,8 +313,7 @@ def _fused(stages: tuple[Stage, ...], plan: Plan) -> Callable[..., Any]:
         env = dict(env)
         for stage in stages:
             keep_result(env, stage.name, stage.run(plan, *(env[name] for name in stage.needs)))
-        overflowed = [env["clusters"].overflowed] if "clusters" in env else []
-        overflowed += [env["assign"].overflowed] if "assign" in env else []
+        overflowed = [env[name].overflowed for name in ("clusters", "assign", "shadow_merge") if name in env]
         return env[stages[-1].name], jax.numpy.stack(overflowed).any() if overflowed else np.bool_(False)
 
     return jax.jit(run)
@@ -215,7 +341,9 @@ def run_stages(
         grid_keys *= 2
     fitting = Sizes(rounded_up("cells", grid_keys), rounded_up("blocks", n_runs), rounded_up("pairs", 0))
     sizes = fitting.covering(sizes) if sizes else fitting
-    for stage in technique.stages_of(inputs.has_transparent):
+    if "shadow_tasks" in env and not sizes.shadow:
+        sizes = replace(sizes, shadow=cast_counted(config, inputs)[1])
+    for stage in technique.stages_of(technique.plan(config), inputs.has_transparent):
         while True:
             plan = narrowed(stage, planned(config, sizes))
             result = stage_program(stage, plan)(*(env[name] for name in stage.needs))
@@ -247,14 +375,16 @@ def lengths_of(config: Configuration, env: dict[str, Any], inputs: FrameInputs) 
 class FrameCounts:
     """Exact counts of one frame.
 
-    - `technique`: what the technique does, whatever the `batch`; see `op_counts`.
-    - `of_block`: lengths of the blocks' lists, the `n_solid_blocks` of solid samples first; `walk_rows`,
-      `light_runs`: what `at_batch` needs besides.
+    - `technique`: what the technique as published does, whatever the `batch` and the `assigner` (but for `memory`);
+      see `op_counts`.
+    - `of_block`: lengths of the blocks' lists, the `n_solid_blocks` of solid samples first; `walked`,
+      `walk_rows`, `light_runs`: what `at_batch` needs besides.
     """
 
     technique: OpCounts
     of_block: np.ndarray
     n_solid_blocks: int
+    walked: Walked
     walk_rows: tuple[int, ...]
     light_runs: int
     branching: int
@@ -262,21 +392,26 @@ class FrameCounts:
 
     def at_batch(self, batch: int) -> OpCounts:
         """All counts, with those of this implementation's chunks."""
-        chunk = walk_chunk(batch, self.branching, self.sizes.pairs)
+        chunk = assign_chunk(self.walked, batch, self.branching, self.sizes.pairs)
         capacity = self.sizes.blocks or len(self.of_block)
         own = batch_counts(self.of_block, self.n_solid_blocks, self.walk_rows, batch, capacity, chunk)
         if self.light_runs:
             own = added(own, light_volume_batch_counts(self.light_runs, volume_chunk(self.sizes.pairs, batch)))
         return self.technique | own
 
+    def of(self, config: Configuration) -> OpCounts:
+        """All counts of one of the configurations that have these."""
+        return self.at_batch(shading_batch(config))
+
     def as_arrays(self) -> dict[str, np.ndarray]:
         """For a cache; the inverse of `from_arrays`."""
-        sizes = (self.sizes.cells, self.sizes.blocks, self.sizes.pairs)
+        sizes = (self.sizes.cells, self.sizes.blocks, self.sizes.pairs, *self.sizes.shadow)
         return {
             "names": np.array(list(self.technique)),
             "counts": np.array(list(self.technique.values()), np.int64),
             "of_block": self.of_block,
             "scalars": np.array([self.n_solid_blocks, self.light_runs, self.branching, *sizes], np.int64),
+            "walked": np.array(self.walked),
             "walk_rows": np.array(self.walk_rows, np.int64),
         }
 
@@ -284,15 +419,20 @@ class FrameCounts:
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> FrameCounts:
         technique = {str(name): int(value) for name, value in zip(arrays["names"], arrays["counts"], strict=True)}
         walk_rows = tuple(int(rows) for rows in arrays["walk_rows"])
-        n_solid_blocks, light_runs, branching, *sizes = (int(value) for value in arrays["scalars"])
-        return cls(technique, arrays["of_block"], n_solid_blocks, walk_rows, light_runs, branching, Sizes(*sizes))
+        n_solid_blocks, light_runs, branching, cells, blocks, pairs, *shadow = (int(v) for v in arrays["scalars"])
+        sizes = Sizes(cells, blocks, pairs, tuple(shadow))
+        walked: Walked = str(arrays["walked"])  # type: ignore[assignment]
+        return cls(technique, arrays["of_block"], n_solid_blocks, walked, walk_rows, light_runs, branching, sizes)
 
 
 def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None) -> tuple[FrameCounts, ListLengths]:
     """Count what a configuration does on a frame; nothing is shaded."""
+    if REGISTRY[config.technique].casts_shadows:
+        return _count_shadowed(config, inputs, sizes)
     technique = REGISTRY[config.technique]
     if is_listed(config):
-        env, sizes = run_stages(config, inputs, sizes, until="assign")
+        last = "approximate" if approximates(config) else "assign"
+        env, sizes = run_stages(config, inputs, sizes, until=last)
     else:
         env, sizes = inputs.environment(config), NO_SIZES
     lengths = lengths_of(config, env, inputs)
@@ -301,11 +441,12 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     fragments = inputs.fragments(technique.shades_hidden(config))
     counts = shading_counts(lengths, fragments.n_samples, fragments.n_transparent_samples, tile_px)
     counts |= {"hidden_fragments": fragments.n_samples - inputs.fragments(with_hidden=False).n_samples}
-    rows: tuple[int, ...] = ()
-    light_runs = 0
+    walked, rows, light_runs = technique.walked(technique.plan(config), inputs.n_lights), (), 0
     if technique.lists == "clusters":
-        counts |= cluster_counts(lengths, n_cells(env["grid"], inputs.viewport), inputs.n_lights)
-        counts |= assign_counts(env["assign_counts"], inputs.n_lights, branching)
+        listed = list_lengths(env["positions"], env["clusters"], env["listed"])
+        counts |= cluster_counts(listed, n_cells(env["grid"], inputs.viewport), inputs.n_lights)
+        counts |= approximation_counts(listed, lengths)
+        counts |= assign_counts(_published_counts(config, env, inputs), inputs.n_lights, branching)
         rows = walk_rows(env["assign_counts"])
         if technique.one_slice:
             counts["lighting_computations_tile_area"] = counts["light_cluster_pairs"] * tile_px[0] * tile_px[1]
@@ -313,11 +454,47 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
         light_runs = int(env["assign"].total)
         n_tests = inputs.n_lights * inputs.positions(with_hidden=False).n_visible_runs
         counts |= {"lights": inputs.n_lights, "leaf_tests": n_tests, "light_runs": light_runs}
-    structures = [value for name, value in env.items() if name not in _NO_STRUCTURES]
+    # By identity: lists that nothing was taken off are those that were assigned.
+    structures = list({id(value): value for name, value in env.items() if name not in _NO_STRUCTURES}.values())
     counts |= memory_counts(env["gbuffer"], structures, fragments.n_samples, counts.get("light_cluster_pairs", 0))
     counts |= gbuffer_traffic(technique.reads_gbuffer, counts)
-    frame_counts = FrameCounts(counts, lengths.of_block, lengths.n_solid_blocks, rows, light_runs, branching, sizes)
+    frame_counts = FrameCounts(
+        counts, lengths.of_block, lengths.n_solid_blocks, walked, rows, light_runs, branching, sizes
+    )
     return frame_counts, lengths
+
+
+def _count_shadowed(config: Configuration, inputs: FrameInputs, sizes: Sizes | None) -> tuple[FrameCounts, ListLengths]:
+    """What shading does as for its lists, with what finding the shadows takes."""
+    shading, lengths = count(lists_configuration(config), inputs, sizes)
+    counts = dict(shading.technique)
+    suns = inputs.shadows.scene.suns.n_lights
+    counts["lighting_computations"] += suns * counts["samples"]
+    counts["shadow_lights"] = len(inputs.shadows.lights)
+    shadow: tuple[int, ...] = ()
+    if config.technique not in SHADOW_REFERENCES:
+        cast, shadow = cast_counted(config, inputs)
+        own = shadows_counts([each.counts for each in cast])
+        counts |= own | {"memory": counts["memory"] + own["memory"]}
+    return replace(shading, technique=counts, sizes=replace(shading.sizes, shadow=shadow)), lengths
+
+
+def cast_counted(config: Configuration, inputs: FrameInputs) -> tuple[list[CastShadows], tuple[int, ...]]:
+    """Shadows of all lights on each view, with tests and counts, and the capacities that hold them."""
+    frames = [receiving(task) for task in inputs.shadows.tasks(config)]
+    plan, masks = fitted_to_all(config.technique, shadow_plan(config), frames)
+    return [on_host(mask, plan, frame) for mask, frame in zip(masks, frames, strict=True)], shadow_sizes(plan)
+
+
+def _published_counts(config: Configuration, env: dict[str, Any], inputs: FrameInputs) -> AssignCounts:
+    """What the technique's own assigner does, however the lists of `env` were made."""
+    technique = REGISTRY[config.technique]
+    published = replace(technique.plan(config), assigner="published")
+    if technique.walked(published, inputs.n_lights) == "all_pairs":
+        return every_pair(int(env["clusters"].n_clusters), inputs.n_lights)
+    if technique.plan(config) == published:
+        return env["assign_counts"]
+    return run_stages(config.replaced(assigner="published"), inputs, until="assign")[0]["assign_counts"]
 
 
 def is_listed(config: Configuration) -> bool:

@@ -76,7 +76,8 @@ def load_gltf(path: Path) -> Scene:
     instances = [(p, world) for mesh, world in placed for p in range(first[mesh], first[mesh + 1])]
     scene = _assemble(path.stem, document, flat, instances)
     cameras = cameras_of(document, nodes)
-    return replace(scene, cameras=cameras, lights=lights_of(document, nodes, scene.diagonal_m))
+    lights, suns = lights_of(document, nodes, scene.diagonal_m)
+    return replace(scene, cameras=cameras, lights=lights, suns=suns)
 
 
 def _primitives(document: Document) -> list[list[Primitive]]:

@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from vtfs.camera import CameraPath, Pose, Viewport
+from vtfs.directional_lights import DirectionalLights
 from vtfs.gltf_document import Document, Json, indices_of, number_of, numbers_of, object_of, triple
 from vtfs.input_error import InputError
 from vtfs.lights import Lights, cone_cosines
@@ -95,13 +96,15 @@ def cameras_of(document: Document, nodes: list[tuple[Json, np.ndarray]]) -> Came
     return CameraPath(Viewport(max(1, round(720 * aspect)), 720), fov_y_deg, near_m, far_m, tuple(poses))
 
 
-def lights_of(document: Document, nodes: list[tuple[Json, np.ndarray]], diagonal_m: float) -> Lights | None:
-    """Point and spot lights of KHR_lights_punctual; directional ones reach everywhere and are left out."""
+def lights_of(
+    document: Document, nodes: list[tuple[Json, np.ndarray]], diagonal_m: float
+) -> tuple[Lights | None, DirectionalLights]:
+    """Lights of KHR_lights_punctual: points and spots, or None where there are none; and directional ones."""
     extension = object_of(object_of(document.json, "extensions", "extensions"), "KHR_lights_punctual", "extensions")
     entries = extension.get("lights", [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError("KHR_lights_punctual.lights: must be a list of objects; export the file again.")
-    rows = []
+    rows, suns = [], []
     for node, world in nodes:
         reference = object_of(object_of(node, "extensions", "a node"), "KHR_lights_punctual", "a node")
         if not reference:
@@ -111,27 +114,33 @@ def lights_of(document: Document, nodes: list[tuple[Json, np.ndarray]], diagonal
             raise InputError(
                 f"a node's KHR_lights_punctual.light = {str(number)[:40]}: must be one of {len(entries)} lights."
             )
-        row = _light(entries[number], f"KHR_lights_punctual.lights[{number}]", world, diagonal_m)
-        if row is not None:
-            rows.append(row)
+        where = f"KHR_lights_punctual.lights[{number}]"
+        if entries[number].get("type") == "directional":
+            suns.append((*world[:3, 2], *_colour(entries[number], where)))  # it shines along -z
+        else:
+            rows.append(_light(entries[number], where, world, diagonal_m))
+    directional = DirectionalLights(*np.split(np.array(suns).reshape(-1, 6), 2, axis=1))
     if not rows:
-        return None
+        return None, directional
     table = np.array(rows)
-    return Lights(table[:, 0:3], table[:, 3], table[:, 4:7], table[:, 7:10], table[:, 10], table[:, 11])
+    lights = Lights(table[:, 0:3], table[:, 3], table[:, 4:7], table[:, 7:10], table[:, 10], table[:, 11])
+    return lights, directional
 
 
-def _light(entry: Json, where: str, world: np.ndarray, diagonal_m: float) -> tuple[float, ...] | None:
-    """Position, range, colour, direction and cone of one light."""
-    kind = entry.get("type")
-    if kind == "directional":
-        log.warning("%s: directional lights have no range and are left out", where)
-        return None
-    if kind not in ("point", "spot"):
-        raise InputError(f"{where}.type = {str(kind)[:40]}: must be point or spot.")
+def _colour(entry: Json, where: str) -> np.ndarray:
     intensity = number_of(entry, "intensity", where, 1.0)
     colour = np.array(numbers_of(entry, "color", where, 3, (1, 1, 1))) * intensity
     if (colour < 0).any():
         raise InputError(f"{where}: color times intensity = {colour}: must be 0 or more.")
+    return colour
+
+
+def _light(entry: Json, where: str, world: np.ndarray, diagonal_m: float) -> tuple[float, ...]:
+    """Position, range, colour, direction and cone of one light."""
+    kind = entry.get("type")
+    if kind not in ("point", "spot"):
+        raise InputError(f"{where}.type = {str(kind)[:40]}: must be point, spot or directional.")
+    colour = _colour(entry, where)
     range_m = number_of(entry, "range", where, 0.0)
     if "range" in entry and not range_m > 0:
         raise InputError(f"{where}.range = {range_m:g}: must be above 0.")

@@ -3,7 +3,8 @@
 `wide_tree.walk` keeps pairs in order of queries. Here they are kept in order of nodes, which is what merging needs:
 whether any triangle accepts a node is a difference of two prefix sums, and the triangles of a leaf come out side by
 side. Lists are padded to groups, so that one row of the tree is loaded for a group and its tests pack into one word a
-child. Nothing is scattered and nothing sorted.
+child. Nothing is sorted; and nothing is scattered in `split`, which suits a CPU, where a GPU is better off with
+`split_at_once`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
-from vtfs.bit_lists import last_not_above, n_bits_set, nth_bit_set
+from vtfs.bit_lists import bits_below, last_not_above, n_bits_set, nth_bit_set
 
 Hits = tuple[UInt32[Array, "groups branching"], UInt32[Array, "groups branching"], Int[Array, ""]]
 """For each group and child: which of the group's triangles go on to the child, and which accept it; and any count."""
@@ -62,38 +63,84 @@ def one_list(member: Bool[Array, " triangles"], lanes: int, absent: int) -> Node
     return NodeLists(triangle.reshape(n_groups, lanes), group_starts(count, lanes), count)
 
 
+Pairs = tuple[Int[Array, " capacity"], Int[Array, " capacity"]]
+"""A triangle, and a node that it goes on to."""
+
+
+def pairs_of(lists: NodeLists, absent: int, capacity: int) -> tuple[Pairs, Int[Array, ""]]:
+    """All (triangle, node) pairs in order of nodes, and how many there are, also where they are more."""
+    ends = jnp.cumsum(lists.count, dtype=jnp.int32)
+    starts = jnp.concatenate([jnp.zeros(1, jnp.int32), ends])
+    place = jnp.arange(capacity, dtype=jnp.int32)
+    node = jnp.minimum(last_not_above(starts, place), lists.count.shape[0] - 1)
+    lane = place - starts[node]
+    lanes = lists.triangle.shape[1]
+    group = jnp.minimum(lists.start[node] + lane // lanes, lists.triangle.shape[0] - 1)
+    there = place < ends[-1]
+    return (jnp.where(there, lists.triangle[group, lane % lanes], absent), jnp.where(there, node, 0)), ends[-1]
+
+
+def grouped(
+    triangle: Int[Array, " capacity"],
+    node: Int[Array, " capacity"],
+    n_pairs: Int[Array, ""],
+    dropped: Bool[Array, " nodes"],
+    lanes: int,
+    absent: int,
+    capacity: int,
+) -> NodeLists:
+    """Pairs in order of nodes, as lists; those of dropped nodes are left out."""
+    n_nodes, n_places = dropped.shape[0], triangle.shape[0]
+    there = jnp.arange(n_places, dtype=jnp.int32) < n_pairs
+    ascending = jnp.concatenate([jnp.full(1, -1, jnp.int32), jnp.where(there, node, n_nodes)])
+    first = last_not_above(ascending, jnp.arange(-1, n_nodes, dtype=jnp.int32))
+    count = jnp.where(dropped, 0, first[1:] - first[:-1])
+    start = group_starts(count, lanes)
+    group = jnp.arange(capacity, dtype=jnp.int32)
+    own = jnp.minimum(last_not_above(start, group), n_nodes - 1)
+    lane = ((group - start[own]) * lanes)[:, None] + jnp.arange(lanes, dtype=jnp.int32)
+    listed = triangle[jnp.minimum(first[own][:, None] + lane, n_places - 1)]
+    return NodeLists(jnp.where(lane < count[own][:, None], listed, absent), start, count)
+
+
 class Split(eqx.Module):
     """What one level did.
 
     - `lists`: of the children; `accepts`: how many triangles accept each child.
-    - `n_accepted`: (triangle, child) pairs accepted; `n_refined`: pairs that went on; `extra`: see `Hits`.
+    - `n_accepted`: (triangle, child) pairs accepted; `n_refined`: pairs that went on; `n_dropped`: that would have, but
+      for `drop`; `extra`: see `Hits`.
     """
 
     lists: NodeLists
     accepts: Int[Array, " children"]
     n_accepted: Int[Array, ""]
     n_refined: Int[Array, ""]
+    n_dropped: Int[Array, ""]
     extra: Int[Array, ""]
+
+
+Test = Callable[[Int[Array, "chunk lanes"], Int[Array, " chunk"]], Hits]
+Drop = Callable[[Bool[Array, " children"]], Bool[Array, " children"]]
 
 
 def split(
     lists: NodeLists,
-    test: Callable[[Int[Array, "chunk lanes"], Int[Array, " chunk"]], Hits],
-    drop: Callable[[Bool[Array, " children"]], Bool[Array, " children"]],
+    test: Test,
+    drop: Drop,
     branching: int,
     lanes: int,
     absent: int,
     capacity: int,
     chunk: int,
 ) -> Split:
-    """From the lists of a level to those of its children.
+    """From the lists of a level to those of its children, in chunks; each place looks for its triangle by bisection.
 
     **Arguments:**
 
     - `test`: hits of some groups, given their triangles and their node.
     - `drop`: children whose lists are left out, given which are accepted.
     - `lanes`: of the children's groups; `capacity`: children's groups.
-    - `chunk`: groups tested or written at once. Where it covers a capacity there is no loop.
+    - `chunk`: groups tested or written at once.
     """
     n_in, lanes_in = lists.triangle.shape
     n_groups = jnp.minimum(lists.n_groups, n_in)
@@ -102,42 +149,31 @@ def split(
     node_of_group = last_not_above(lists.start, jnp.arange(_whole_chunks(n_in, chunk), dtype=jnp.int32))
     node_of_group = jnp.minimum(node_of_group, lists.count.shape[0] - 1)
 
-    def test_chunk(first, n: int, before):
-        group = first + jnp.arange(n, dtype=jnp.int32)
-        node = jax.lax.dynamic_slice_in_dim(node_of_group, first, n)
-        triangle = jax.lax.dynamic_slice_in_dim(lists.triangle, first, n)
+    def test_chunk(first, before):
+        group = first + jnp.arange(chunk, dtype=jnp.int32)
+        node = jax.lax.dynamic_slice_in_dim(node_of_group, first, chunk)
+        triangle = jax.lax.dynamic_slice_in_dim(lists.triangle, first, chunk)
         triangle = jnp.where((group < n_groups)[:, None], triangle, absent)
         goes_on, accepts, extra = test(triangle, node)
         both = jnp.concatenate([n_bits_set(goes_on), n_bits_set(accepts)], axis=1)
         ends = jnp.cumsum(both, axis=0, dtype=jnp.int32) + before[None]
         return goes_on, ends - both, ends[-1], extra
 
-    totals = jnp.zeros(2 * branching, jnp.int32)
-    if chunk >= n_in:
-        bits, below, totals, extra = test_chunk(jnp.int32(0), n_in, totals)
-        extra = extra.astype(jnp.int64)
-    else:
-        n_padded = _whole_chunks(n_in, chunk)
+    def loop(state):
+        first, bits, below, totals, extra = state
+        goes_on, starts, totals, more = test_chunk(first, totals)
+        bits = jax.lax.dynamic_update_slice_in_dim(bits, goes_on, first, 0)
+        below = jax.lax.dynamic_update_slice_in_dim(below, starts, first, 0)
+        return first + chunk, bits, below, totals, extra + more
 
-        def loop(state):
-            first, bits, below, totals, extra = state
-            goes_on, starts, totals, more = test_chunk(first, chunk, totals)
-            bits = jax.lax.dynamic_update_slice_in_dim(bits, goes_on, first, 0)
-            below = jax.lax.dynamic_update_slice_in_dim(below, starts, first, 0)
-            return first + chunk, bits, below, totals, extra + more
-
-        padded = NodeLists(
-            jnp.pad(lists.triangle, ((0, n_padded - n_in), (0, 0)), constant_values=absent), lists.start, lists.count
-        )
-        lists = padded
-        state = (
-            jnp.int32(0),
-            jnp.zeros((n_padded, branching), jnp.uint32),
-            jnp.zeros((n_padded, 2 * branching), jnp.int32),
-            totals,
-            jnp.int64(0),
-        )
-        _, bits, below, totals, extra = jax.lax.while_loop(lambda state: state[0] < n_groups, loop, state)
+    n_padded = _whole_chunks(n_in, chunk)
+    pad = jnp.full((n_padded - n_in, lanes_in), absent, jnp.int32)
+    lists = NodeLists(jnp.concatenate([lists.triangle, pad]), lists.start, lists.count)
+    state = (
+        jnp.int32(0), jnp.zeros((n_padded, branching), jnp.uint32), jnp.zeros((n_padded, 2 * branching), jnp.int32),
+        jnp.zeros(2 * branching, jnp.int32), jnp.int64(0),
+    )  # fmt: skip
+    _, bits, below, totals, extra = jax.lax.while_loop(lambda state: state[0] < n_groups, loop, state)
 
     # Counts of each (node, child), by the difference of what lies below its first and behind its last group.
     n_rows = below.shape[0]
@@ -159,9 +195,9 @@ def split(
     child_of_group = last_not_above(start, jnp.arange(_whole_chunks(capacity, chunk), dtype=jnp.int32))
     child_of_group = jnp.minimum(child_of_group, kept.shape[0] - 1)
 
-    def write_chunk(first, n: int):
-        group = first + jnp.arange(n, dtype=jnp.int32)
-        child = jax.lax.dynamic_slice_in_dim(child_of_group, first, n)
+    def write_chunk(first):
+        group = first + jnp.arange(chunk, dtype=jnp.int32)
+        child = jax.lax.dynamic_slice_in_dim(child_of_group, first, chunk)
         node, which = child // branching, child % branching
         k = ((group - start[child]) * lanes)[:, None] + jnp.arange(lanes, dtype=jnp.int32)
         low, size = lists.start[node], lists.start[node + 1] - lists.start[node]
@@ -178,29 +214,67 @@ def split(
         is_there = (k < kept[child][:, None]) & (group < n_out)[:, None]
         return jnp.where(is_there, triangle, absent)
 
-    if chunk >= capacity:
-        triangle = write_chunk(jnp.int32(0), capacity)
-    else:
-        n_padded = _whole_chunks(capacity, chunk)
+    def write(state):
+        first, triangle = state
+        return first + chunk, jax.lax.dynamic_update_slice_in_dim(triangle, write_chunk(first), first, 0)
 
-        def write(state):
-            first, triangle = state
-            return first + chunk, jax.lax.dynamic_update_slice_in_dim(triangle, write_chunk(first, chunk), first, 0)
-
-        state = (jnp.int32(0), jnp.full((n_padded, lanes), absent, jnp.int32))
-        _, triangle = jax.lax.while_loop(lambda state: state[0] < n_out, write, state)
-        triangle = triangle[:capacity]
+    state = (jnp.int32(0), jnp.full((_whole_chunks(capacity, chunk), lanes), absent, jnp.int32))
+    _, triangle = jax.lax.while_loop(lambda state: state[0] < n_out, write, state)
+    triangle = triangle[:capacity]
     return Split(
-        NodeLists(triangle, start, kept),
-        accepts,
-        jnp.sum(accepts, dtype=jnp.int64),
-        jnp.sum(kept, dtype=jnp.int64),
-        extra,
-    )
+        NodeLists(triangle, start, kept), accepts, *_totals(accepts, count, kept), extra
+    )  # fmt: skip
+
+
+def _totals(accepts: Array, count: Array, kept: Array) -> tuple[Array, Array, Array]:
+    """Pairs accepted, gone on and dropped."""
+    n_accepted, n_on, n_kept = (jnp.sum(c, dtype=jnp.int64) for c in (accepts, count, kept))
+    return n_accepted, n_kept, n_on - n_kept
+
+
+def split_at_once(
+    lists: NodeLists, test: Test, drop: Drop, branching: int, lanes: int, absent: int, capacity: int
+) -> Split:
+    """What `split` does, without loops: each triangle is scattered to its place in each child's list.
+
+    A GPU tells the many that go nowhere apart at the speed of arithmetic; a CPU would take 20 ns for each.
+    """
+    n_in, lanes_in = lists.triangle.shape
+    n_nodes = lists.count.shape[0]
+    n_groups = jnp.minimum(lists.n_groups, n_in)
+    group = jnp.arange(n_in, dtype=jnp.int32)
+    node = jnp.minimum(last_not_above(lists.start, group), n_nodes - 1)
+    is_live = (group < n_groups)[:, None]
+    triangle = jnp.where(is_live, lists.triangle, absent)
+    goes_on, accepting, extra = test(triangle, node)
+
+    n_on, n_accepting = n_bits_set(goes_on), n_bits_set(accepting)
+    ends = jnp.cumsum(n_on, axis=0, dtype=jnp.int32)
+    below = ends - n_on
+    inside = (lists.start < n_groups)[:, None]
+    at = jnp.where(inside, below[jnp.minimum(lists.start, n_in - 1)], ends[-1])
+    count = (at[1:] - at[:-1]).reshape(-1)
+    row = jnp.where((n_accepting > 0).any(axis=1), node, n_nodes)
+    accepts = jnp.zeros((n_nodes, branching), jnp.int32).at[row].add(n_accepting, mode="drop").reshape(-1)
+    kept = jnp.where(drop(accepts > 0), 0, count)
+    start = group_starts(kept, lanes)
+
+    child = node[:, None] * branching + jnp.arange(branching, dtype=jnp.int32)
+    first = jnp.where(kept[child] > 0, start[child] * lanes + below - at[node], capacity * lanes)
+    lane = jnp.arange(lanes_in, dtype=jnp.int32)
+    word = goes_on[:, :, None]
+    place = first[:, :, None] + n_bits_set(word & bits_below(lane))
+    place = jnp.where((word >> lane.astype(jnp.uint32) & 1) == 1, place, capacity * lanes)
+    listed = jnp.broadcast_to(triangle[:, None, :], place.shape)
+    out = jnp.full(capacity * lanes, absent, jnp.int32).at[place].set(listed, mode="drop", unique_indices=True)
+    return Split(
+        NodeLists(out.reshape(capacity, lanes), start, kept), accepts, *_totals(accepts, count, kept),
+        extra.astype(jnp.int64),
+    )  # fmt: skip
 
 
 def _whole_chunks(n: int, chunk: int) -> int:
-    return n if chunk >= n else -(-n // chunk) * chunk
+    return -(-n // chunk) * chunk
 
 
 def _last_not_above_in(flat, stride: int, column, low, size, value, widest, capacity: int):
@@ -208,17 +282,11 @@ def _last_not_above_in(flat, stride: int, column, low, size, value, widest, capa
     n_steps = max(capacity - 1, 1).bit_length()
 
     def halve(i, at):
-        step = 1 << (n_steps - 1 - i) if isinstance(i, int) else jnp.int32(1) << (n_steps - 1 - i)
-        candidate = at + step
+        candidate = at + (jnp.int32(1) << (n_steps - 1 - i))
         there = flat[jnp.minimum(low[:, None] + candidate, capacity - 1) * stride + column[:, None]]
         return jnp.where((candidate < size[:, None]) & (there <= value), candidate, at)
 
-    at = jnp.zeros_like(value)
-    if jax.default_backend() == "cpu":
-        # Most lists are short: only the steps that the longest one needs.
-        needed = jnp.int32(32) - jax.lax.clz(jnp.maximum(widest - 1, 1)).astype(jnp.int32)
-        at = jax.lax.fori_loop(jnp.int32(n_steps) - jnp.minimum(needed, n_steps), jnp.int32(n_steps), halve, at)
-    else:
-        for i in range(n_steps):
-            at = halve(i, at)
-    return low[:, None] + at
+    # Most lists are short: only the steps that the longest one needs.
+    needed = jnp.int32(32) - jax.lax.clz(jnp.maximum(widest - 1, 1)).astype(jnp.int32)
+    first = jnp.int32(n_steps) - jnp.minimum(needed, n_steps)
+    return low[:, None] + jax.lax.fori_loop(first, jnp.int32(n_steps), halve, jnp.zeros_like(value))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vtfs.input_error import InputError
 
@@ -101,11 +101,27 @@ PARAMETERS: dict[str, Parameter] = {
             "how slices grow: by a factor, not at all, or as the values of the depth buffer",
             choices=("self_similar", "linear", "ndc"),
         ),
-        Parameter("branching", 32, "children of a node of the light tree", choices=(2, 4, 8, 16, 32, 64)),
+        Parameter("branching", 32, "children of a node of the tree", choices=(2, 4, 8, 16, 32, 64)),
+        Parameter(
+            "resort_every",
+            1,
+            "frames from one sort of the light tree to the next; between them its order is kept and its boxes are "
+            "refitted. Above 1 lists are made as published, by that tree",
+            low=1,
+            high=64,
+        ),
+        Parameter(
+            "assigner",
+            "auto",
+            "how lists are made, which never changes them: as published (all lights against all cells, or a tree of "
+            "lights), from groups of cells to cells, or, as faster on the device, all pairs while lights are few, "
+            "then groups",
+            choices=("auto", "published", "coarse_to_fine"),
+        ),
         Parameter(
             "batch",
             0,
-            "queries in one chunk: clusters when assigning, samples when shading; "
+            "queries in one chunk: clusters when assigning, samples when shading, triangles when casting shadows; "
             "0: all at once (on a CPU: what fits its cache)",
             choices=_BATCHES,
         ),
@@ -149,6 +165,40 @@ PARAMETERS: dict[str, Parameter] = {
             choices=("float32", "float16", "bfloat16"),
         ),
         Parameter("light_cutoff", 0.0, "lights reach only where their window is above this", low=0.0, high=0.99),
+        Parameter(
+            "planes", "on", "planes that reject nodes besides the four of a shadow volume", choices=("on", "off")
+        ),
+        Parameter(
+            "front_faces",
+            "cast",
+            "triangles that face the light: they cast shadows, or are culled, which is right for closed meshes",
+            choices=("cast", "culled"),
+        ),
+        Parameter(
+            "feedback",
+            "on",
+            "triangles go on only into nodes that no other one has shadowed as a whole",
+            choices=("on", "off"),
+        ),
+        Parameter(
+            "stencil",
+            "unlimited",
+            "counts of a stencil: without limit, or 8 bits that wrap or saturate",
+            choices=("unlimited", "wrap", "saturate"),
+        ),
+        Parameter(
+            "around_eye",
+            "on",
+            "z-pass starts with the volumes around the eye; off, as in textbooks, it fails inside of one",
+            choices=("on", "off"),
+        ),
+        Parameter(
+            "approximate",
+            0.0,
+            "lights that vary by at most this over a cluster, as a share of all light there, are evaluated once for it",
+            low=0.0,
+            high=1.0,
+        ),
     )
 }
 
@@ -156,22 +206,43 @@ _TILES = ("tile_px", "tile_px_x", "tile_px_y", "grid")
 _SLICES = ("depth_slices", "depth_scheme")
 _CLUSTERS = ("bounds", "cull", "unique", "normal_bins", "normal_cones")
 _SHADING = ("gbuffer", "light_cutoff")
-_BRUTE_FORCE = ("batch", *_CLUSTERS, *_SHADING)
-_BY_TREE = (*_TILES, *_SLICES, "branching", "batch", *_CLUSTERS, "leaf_test", *_SHADING)
+_BRUTE_FORCE = ("assigner", "batch", *_CLUSTERS, *_SHADING, "approximate")
+_TREE = ("branching", "resort_every", "assigner")
+_BY_TREE = (*_TILES, *_SLICES, *_TREE, "batch", *_CLUSTERS, "leaf_test", *_SHADING, "approximate")
+_VOLUMES = ("tile_px", "branching", "batch", "planes", "feedback", "front_faces")
+_STENCIL = ("tile_px", "branching", "stencil", "front_faces")
+
+ACCURACY = ("gbuffer", "light_cutoff", "approximate", "front_faces", "stencil", "around_eye")
+"""Parameters that change the image: their defaults are exact."""
 
 TECHNIQUES: dict[str, tuple[str, ...]] = {
     "forward": ("prepass", "batch", *_SHADING),
     "deferred": ("batch", *_SHADING),
     "deferred_stencil": ("batch", *_SHADING),
-    "tiled_forward": (*_TILES, "batch", "cull", *_SHADING),
+    "tiled_forward": (*_TILES, "assigner", "batch", "cull", *_SHADING),
     "tiled_forward_prez": (*_TILES, *_BRUTE_FORCE),
     "tiled_deferred": (*_TILES, *_BRUTE_FORCE),
     "clustered_deferred": _BY_TREE,
     "clustered_forward": _BY_TREE,
     "volume_tiled": (*_TILES, *_SLICES, *_BRUTE_FORCE),
     "volume_tiled_bvh": _BY_TREE,
+    "z_pass": (*_STENCIL, "around_eye", *_SHADING),
+    "z_fail": (*_STENCIL, *_SHADING),
+    "ptsv": (*_VOLUMES, *_SHADING),
+    "cluster_hierarchy": ("tile_px", "depth_slices", "bounds", *_VOLUMES[1:], *_SHADING),
+    "shadow_rays": ("front_faces", *_SHADING),
+    "brute_force": ("front_faces", *_SHADING),
 }
 """Techniques and the parameters each one has, in the order in which they are shown."""
+
+SHADOW_NAMES = ("z_pass", "z_fail", "ptsv", "cluster_hierarchy", "shadow_rays", "brute_force")
+"""Those that find which samples lie in the shadow of which light, and then shade by `LISTS_OF_SHADOWED`."""
+
+SHADOW_REFERENCES = ("shadow_rays", "brute_force")
+"""What the others are checked against; they run on the host."""
+
+LISTS_OF_SHADOWED = "clustered_deferred"
+"""Whose light lists, at its defaults, a shadow technique shades with."""
 
 TUNED_TECHNIQUES = ("forward", "tiled_deferred", "volume_tiled_bvh")
 """What a search compares unless the user says otherwise. Nothing is rasterised here, so that techniques which differ
@@ -181,12 +252,28 @@ in their passes over the geometry run the same programs: `tiled_forward_prez` th
 _OWN_DEFAULTS: dict[tuple[str, str], Value] = {
     ("tiled_deferred", "bounds"): "depth_range",
     ("tiled_forward_prez", "bounds"): "depth_range",
+    ("cluster_hierarchy", "bounds"): "explicit",
+    **{(name, "tile_px"): 8 for name in ("z_pass", "z_fail", "ptsv", "cluster_hierarchy")},
+    # What tells these from one another is how they make their lists.
+    ("volume_tiled", "assigner"): "published",
+    ("volume_tiled_bvh", "assigner"): "published",
+    ("clustered_deferred", "assigner"): "published",
+    ("clustered_forward", "assigner"): "published",
 }
+
+_OWN_CHOICES: dict[tuple[str, str], tuple[Value, ...]] = {("cluster_hierarchy", "bounds"): ("implicit", "explicit")}
 
 
 def default_value(technique: str, name: str) -> Value:
     """What a technique does where the configuration does not say."""
     return _OWN_DEFAULTS.get((technique, name), PARAMETERS[name].default)
+
+
+def parameter_of(technique: str, name: str) -> Parameter:
+    """A parameter with the default and the choices that a technique has."""
+    parameter = PARAMETERS[name]
+    choices = _OWN_CHOICES.get((technique, name), parameter.choices)
+    return replace(parameter, default=default_value(technique, name), choices=choices)
 
 
 @dataclass(frozen=True)
@@ -210,6 +297,15 @@ class Configuration:
         changed = [f"{name}={value}" for name, value in self.items if value != default_value(self.technique, name)]
         return " ".join([self.technique, *changed])
 
+    def exact(self) -> Configuration:
+        """The same without what trades accuracy for speed."""
+        exact = {name: default_value(self.technique, name) for name in ACCURACY if name in self.params}
+        return self.replaced(**exact)
+
+    @property
+    def is_exact(self) -> bool:
+        return self == self.exact()
+
     def replaced(self, **changes: Value) -> Configuration:
         """The same configuration with some values changed."""
         return configuration(self.technique, {**self.params, **changes})
@@ -232,9 +328,36 @@ def configuration(technique: str, params: Mapping[str, object] | None = None) ->
             raise InputError(f"parameter `{name}`: unknown; `{technique}` has {', '.join(names)}.")
         if name not in names:
             raise InputError(f"parameter `{name}`: `{technique}` does not have it; it has {', '.join(names)}.")
-    parsed = {name: PARAMETERS[name].parse(given.get(name, default_value(technique, name))) for name in names}
+    parsed = {
+        name: parameter_of(technique, name).parse(given.get(name, default_value(technique, name))) for name in names
+    }
     settled = _settled(technique, parsed)
     return Configuration(technique, tuple((name, settled[name]) for name in names))
+
+
+def changes_shadows(config: Configuration) -> bool:
+    """May its shadows be others than those of its casters, as those of a stencil of 8 bits?"""
+    return any(
+        config.params.get(name, value) != value for name, value in (("stencil", "unlimited"), ("around_eye", "on"))
+    )
+
+
+def lists_configuration(config: Configuration) -> Configuration:
+    """The configuration whose light lists a frame is shaded with: its own, but for shadow techniques."""
+    if config.technique not in SHADOW_NAMES:
+        return config
+    return configuration(LISTS_OF_SHADOWED, {name: config[name] for name in _SHADING})
+
+
+def counted_configuration(config: Configuration) -> Configuration:
+    """The configuration that has the same counts of technique: a batch of clusters or samples changes none of them,
+    a batch of triangles does where what it shadows is left out afterwards."""
+    return config if config.technique in SHADOW_NAMES else config.replaced(batch=0)
+
+
+def shading_batch(config: Configuration) -> int:
+    """Samples that are shaded at once; 0: all."""
+    return int(lists_configuration(config)["batch"])
 
 
 def _settled(technique: str, params: dict[str, Value]) -> dict[str, Value]:
@@ -275,4 +398,15 @@ def _settled(technique: str, params: dict[str, Value]) -> dict[str, Value]:
             params["cull"] = "frustum"  # nor is the cell a box
         elif params["bounds"] == "frustum" and not exact:
             params["bounds"] = "implicit"
+    if params.get("assigner") == "coarse_to_fine" and not passes_only_what_meets_the_box(params):
+        name = "leaf_test" if params.get("leaf_test") == "box" else "cull"
+        raise ConflictError(
+            f"parameter `assigner` = 'coarse_to_fine' with {name}={params[name]}: groups are tested by their boxes, "
+            "which that test does not keep to; give cull=box or frustum and leaf_test=sphere, or assigner=published."
+        )
     return params
+
+
+def passes_only_what_meets_the_box(params: Mapping[str, Value]) -> bool:
+    """Is a light listed only where its sphere meets the box of the cell? Lists of groups of cells rely on it."""
+    return params.get("cull", "box") in ("box", "frustum") and params.get("leaf_test", "sphere") == "sphere"

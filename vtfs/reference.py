@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 
+from vtfs.directional_lights import DirectionalLights
 from vtfs.layers import composite
 from vtfs.lights import Lights
 from vtfs.view_samples import ViewSamples
@@ -14,14 +17,38 @@ _BOX_PX = 32
 _MIN_DISTANCE2_M2 = 1e-4
 
 
-def forward_reference(samples: ViewSamples, lights: Lights) -> np.ndarray:
-    """The image of `forward` in float64 `[h, w, 3]`, transparent layers blended over it; 0 where nothing is seen."""
+@dataclass(frozen=True)
+class ViewShadows:
+    """Shadows on one view: the solid samples, or a transparent layer.
+
+    - `slot`: of each light, which of the masks is its shadow, -1 for none; the directional lights have the first ones.
+    - `masks`: samples in shadow, bool `[slots, h, w]`.
+    """
+
+    slot: np.ndarray
+    masks: np.ndarray
+    suns: DirectionalLights
+
+
+def forward_reference(
+    samples: ViewSamples, lights: Lights, shadows: Sequence[ViewShadows | None] | None = None
+) -> np.ndarray:
+    """The image of `forward` in float64 `[h, w, 3]`, transparent layers blended over it; 0 where nothing is seen.
+
+    **Arguments:**
+
+    - `shadows`: of the solid samples and each layer; a light adds nothing in its shadow, and directional lights shine.
+    """
     layers = samples.layers.transparent
-    blended = tuple((_reference(layer.samples, lights), layer.opacity.astype(np.float64)) for layer in layers)
-    return composite(_reference(samples, lights), blended)
+    of_solid, *of_layers = shadows or [None] * (1 + len(layers))
+    blended = tuple(
+        (_reference(layer.samples, lights, own), layer.opacity.astype(np.float64))
+        for layer, own in zip(layers, of_layers, strict=True)
+    )
+    return composite(_reference(samples, lights, of_solid), blended)
 
 
-def _reference(samples: ViewSamples, lights: Lights) -> np.ndarray:
+def _reference(samples: ViewSamples, lights: Lights, shadows: ViewShadows | None) -> np.ndarray:
     """One layer.
 
     A light is left out of a box of 32 x 32 pixels only where the box of their positions lies outside its
@@ -35,7 +62,7 @@ def _reference(samples: ViewSamples, lights: Lights) -> np.ndarray:
         box = np.s_[corner[0] : corner[0] + _BOX_PX, corner[1] : corner[1] + _BOX_PX]
         valid = samples.valid[box]
         if valid.any():
-            image[box][valid] = _shade(samples, box, valid, view)
+            image[box][valid] = _shade(samples, box, valid, view, shadows)
 
     corners = [(y, x) for y in range(0, height, _BOX_PX) for x in range(0, width, _BOX_PX)]
     with ThreadPoolExecutor() as pool:
@@ -43,7 +70,9 @@ def _reference(samples: ViewSamples, lights: Lights) -> np.ndarray:
     return image
 
 
-def _shade(samples: ViewSamples, box: tuple[slice, slice], valid: np.ndarray, view: Lights) -> np.ndarray:
+def _shade(
+    samples: ViewSamples, box: tuple[slice, slice], valid: np.ndarray, view: Lights, shadows: ViewShadows | None
+) -> np.ndarray:
     """`[samples, 3]` of the valid samples of a box; see `shading.reflected` for the formula."""
     position, normal, base, emissive = (
         channel[box][valid].astype(np.float64)
@@ -55,7 +84,11 @@ def _shade(samples: ViewSamples, box: tuple[slice, slice], valid: np.ndarray, vi
     reach = reach[view.range_m[reach] > 0]
     # Pairs in reach only: beyond its range a light's window is exactly 0.
     to_all = [view.position_m[reach, c, None] - position[None, :, c] for c in range(3)]
-    light, sample = np.nonzero(sum(t * t for t in to_all) < view.range_m[reach, None] ** 2)
+    counts = sum(t * t for t in to_all) < view.range_m[reach, None] ** 2
+    if shadows is not None and len(reach):
+        slot = shadows.slot[reach]
+        counts[slot >= 0] &= ~shadows.masks[(slot[slot >= 0], *box)][:, valid]
+    light, sample = np.nonzero(counts)
     to = np.stack([t[light, sample] for t in to_all])
     light = reach[light]
     # A light behind the surface adds nothing; half of them are.
@@ -64,23 +97,40 @@ def _shade(samples: ViewSamples, box: tuple[slice, slice], valid: np.ndarray, vi
     distance2 = np.einsum("cp,cp->p", to, to)
     to_unit = to / np.sqrt(distance2)
     window = (1 - (distance2 / view.range_m[light] ** 2) ** 2) ** 2
+    if samples.camera.is_orthographic:
+        from_eye = np.broadcast_to([0.0, 0.0, -1.0], position.shape)
+    else:
+        from_eye = position / np.linalg.norm(position, axis=1, keepdims=True)
     n = normal[sample].T
-    half = to_unit - (position / np.linalg.norm(position, axis=1, keepdims=True))[sample].T
-    length = np.sqrt(np.einsum("cp,cp->p", half, half))
-    # Light straight from behind the sample has no half vector, and no highlight.
-    n_dot_h = np.maximum(np.einsum("cp,cp->p", n, half) / np.where(length > 0, length, 1), 0)
+    n_dot_h = _highlight(to_unit, n, from_eye[sample].T)
     along = -np.einsum("cp,pc->p", to_unit, view.direction[light])
     cone = ((along - view.cos_outer[light]) / (view.cos_inner - view.cos_outer)[light]).clip(0, 1)
     lit = cone * window / np.maximum(distance2, _MIN_DISTANCE2_M2) * np.einsum("cp,cp->p", n, to_unit)
     gloss = specular[sample] * n_dot_h ** shininess[sample]
-    return np.stack(
+    colour = emissive + np.stack(
         [
-            emissive[:, c]
-            + np.bincount(sample, lit * view.colour[light, c] * (base[sample, c] + gloss), minlength=len(position))
+            np.bincount(sample, lit * view.colour[light, c] * (base[sample, c] + gloss), minlength=len(position))
             for c in range(3)
         ],
         axis=1,
     )
+    if shadows is None:
+        return colour
+    rotation = samples.camera.view_from_world[:3, :3]
+    for toward, sun, mask in zip(shadows.suns.toward, shadows.suns.colour, shadows.masks, strict=False):
+        to_unit = np.broadcast_to((rotation @ toward)[:, None], normal.T.shape)
+        n_dot_h = _highlight(to_unit, normal.T, from_eye.T)
+        lit = np.where(mask[box][valid], 0, np.maximum((normal.T * to_unit).sum(axis=0), 0))
+        colour += lit[:, None] * sun * (base + (specular * n_dot_h**shininess)[:, None])
+    return colour
+
+
+def _highlight(to_light: np.ndarray, normal: np.ndarray, from_eye: np.ndarray) -> np.ndarray:
+    """`max(0, n.h)` of unit vectors, components `[3, n]`."""
+    half = to_light - from_eye
+    length = np.sqrt(np.einsum("cp,cp->p", half, half))
+    # Light straight from behind the sample has no half vector, and no highlight.
+    return np.maximum(np.einsum("cp,cp->p", normal, half) / np.where(length > 0, length, 1), 0)
 
 
 def image_error(image: np.ndarray, reference: np.ndarray, valid: np.ndarray) -> tuple[float, float]:

@@ -66,20 +66,24 @@ def extrapolated_sub_samples(samples: ViewSamples, n_samples: int) -> tuple[View
     One ray a pixel instead of many: within a triangle this is exact, at its edges it is not. Where the plane is seen
     edge-on, or leaves the view's range of depths, a sub-sample keeps the centre's depth.
 
-    **Raises:** `InputError` where there is no pattern of so many samples, or the view is a parallel one.
+    **Raises:** `InputError` where there is no pattern of so many samples.
     """
-    samples.camera.require_perspective("extrapolated sub-samples")
     position, normal = samples.position_m.astype(np.float64), samples.normal.astype(np.float64)
     along = (normal * position).sum(axis=-1)
     views = []
     for offset in pattern(n_samples):
         camera = shifted_camera(samples.camera, offset)
         x, y = camera.pixel_slopes()
-        facing = normal[..., 0] * x + normal[..., 1] * y[:, None] - normal[..., 2]
-        depth_m = np.divide(along, facing, out=np.full(along.shape, np.nan), where=facing != 0)
+        aside = normal[..., 0] * x + normal[..., 1] * y[:, None]
+        if camera.is_orthographic:
+            offset, facing = aside - along, normal[..., 2]
+        else:
+            offset, facing = along, aside - normal[..., 2]
+        depth_m = np.divide(offset, facing, out=np.full(along.shape, np.nan), where=facing != 0)
         leaves = ~((depth_m >= camera.near_m) & (depth_m <= camera.far_m))
         depth_m = np.where(leaves, -position[..., 2], depth_m)
-        moved = np.stack([x * depth_m, y[:, None] * depth_m, -depth_m], axis=-1)
+        width = camera.width_at(depth_m)
+        moved = np.stack([x * width, y[:, None] * width, -depth_m], axis=-1)
         moved[~samples.valid] = 0
         views.append(replace(samples, camera=camera, position_m=moved.astype(np.float32), layers=Layers()))
     return tuple(views)

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from vtfs.camera import CameraPath
+from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
 
@@ -56,7 +57,7 @@ class Scene:
 
     - `vertices_m`: float64 `[V, 3]`; `triangles`: int32 `[T, 3]`; `material_index`: int32 `[T]`.
     - `uv`: float32 `[V, 2]`, v = 0 at the first row of an image (as glTF); None where no triangle needs it.
-    - `cameras`, `lights`: what the file holds, or None.
+    - `cameras`, `lights`: what the file holds, or None; `suns`: its directional lights.
 
     **Raises:** `InputError` where vertices are not finite, indices out of range, or there is no triangle.
     """
@@ -69,6 +70,7 @@ class Scene:
     materials: tuple[Material, ...]
     cameras: CameraPath | None = None
     lights: Lights | None = None
+    suns: DirectionalLights = NO_DIRECTIONAL
 
     def __post_init__(self):
         for name, dtype in (("vertices_m", np.float64), ("triangles", np.int32), ("material_index", np.int32)):

@@ -8,17 +8,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from vtfs.cache import cached
 from vtfs.camera import CameraPath, Viewport, default_cameras, load_cameras
+from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
 from vtfs.gallery import GALLERY, build_scene
+from vtfs.gbuffer_files import load_gbuffer
 from vtfs.input_error import InputError
 from vtfs.lights import Lights, load_lights, scatter_lights
 from vtfs.scene import Scene, load_scene
-from vtfs.view_samples import Tracer, ViewSamples, load_gbuffer, trace_view_samples
+from vtfs.view_samples import Tracer, ViewSamples, trace_view_samples
+
+if TYPE_CHECKING:
+    from vtfs.frame import FrameInputs
+    from vtfs.shadow_inputs import ShadowScene
 
 log = logging.getLogger("vtfs.scene_setup")
 
@@ -37,6 +43,7 @@ class SceneOptions:
 
     - `scene`: a file that `load_scene` reads, a G-buffer `.npz` or a folder of them (one a frame), the name
       of a built-in scene, or `None` for the default one.
+    - `shadow_lights`: lights with a place that cast shadows on each frame; directional ones all do.
     - `lights`: a `lights.csv`, a number of lights to scatter, or `None`: the scene's own, else 1,000.
     """
 
@@ -48,6 +55,7 @@ class SceneOptions:
     lights_per_sample: int = 20
     density: Literal["constant", "fixed"] = "constant"
     n_triangles: int | None = None
+    shadow_lights: int = 1
 
 
 @dataclass
@@ -84,6 +92,27 @@ class SceneSetup:
         return self._source.scene if isinstance(self._source, _TracedScene) else None
 
     @property
+    def suns(self) -> DirectionalLights:
+        """Directional lights, which shine and cast where shadows are asked for."""
+        return self.scene.suns if self.scene is not None else NO_DIRECTIONAL
+
+    def inputs(self, frame: int) -> FrameInputs:
+        """A frame on the device."""
+        from vtfs.frame import FrameInputs  # a scene is set up without the programs too
+
+        return FrameInputs(self.samples(frame), self.lights, frame, shadow_scene=self.shadow_scene)
+
+    @cached_property
+    def shadow_scene(self) -> ShadowScene | None:
+        """What casts shadows; None where the samples are the user's own.
+
+        **Raises:** `InputError` for more lights that cast than there are bits.
+        """
+        from vtfs.shadow_inputs import shadow_scene
+
+        return shadow_scene(self.scene, self.suns, self._options.shadow_lights) if self.scene is not None else None
+
+    @property
     def bounds_m(self) -> tuple[np.ndarray, np.ndarray]:
         """Low and high corner of the scene, or of its visible samples."""
         return self._source.bounds_m(self.cameras)
@@ -114,7 +143,9 @@ class SceneSetup:
     @property
     def key(self) -> str:
         """Of everything that its counts and times depend on."""
-        parts = (self._source.key, self.cameras.key, self.lights.key)
+        parts = [self._source.key, self.cameras.key, self.lights.key]
+        if self.suns.n_lights or self._options.shadow_lights != SceneOptions.shadow_lights:
+            parts += [self.suns.key, f"shadow lights {self._options.shadow_lights}"]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
     def _some_positions(self, frame: int) -> np.ndarray:

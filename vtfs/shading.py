@@ -12,6 +12,7 @@ from vtfs.clusters import Clusters
 from vtfs.fast_power import power
 from vtfs.gbuffer import RUN, GBuffer, LayerTable
 from vtfs.light_lists import POINT_COLUMNS, LightLists
+from vtfs.light_shadows import LightShadows
 
 MIN_DISTANCE2_M2 = 1e-4
 _TINY = 1e-30  # keeps 0 / 0 away; far below any product of lengths that matters
@@ -30,9 +31,26 @@ class Surface(eqx.Module):
     shininess: Float[Array, "*s"]
 
 
-def direction_to_eye(position_m: tuple[Float[Array, "*s"], ...]) -> tuple[Float[Array, "*s"], ...]:
-    """Unit vectors to the eye, which is the origin of view space."""
+class ClusterLight(eqx.Module):
+    """What lights add that are evaluated once a cluster: irradiance and highlight; red, green and blue of each."""
+
+    irradiance: tuple[Float[Array, " clusters"], ...]
+    highlight: tuple[Float[Array, " clusters"], ...]
+
+    def reflected_by(self, part: GBuffer, cluster: Int[Array, " blocks"]) -> tuple[Float[Array, "blocks 32"], ...]:
+        """Red, green and blue that the samples of each block reflect."""
+        return tuple(
+            base.astype(jnp.float32) * irradiance[cluster][:, None]
+            + part.specular.astype(jnp.float32) * highlight[cluster][:, None]
+            for base, irradiance, highlight in zip(part.base_colour, self.irradiance, self.highlight, strict=True)
+        )
+
+
+def direction_to_eye(position_m: tuple[Float[Array, "*s"], ...], is_parallel: bool) -> tuple[Float[Array, "*s"], ...]:
+    """Unit vectors to the eye: the origin of view space, or in a parallel view at infinity along z."""
     x_m, y_m, z_m = position_m
+    if is_parallel:
+        return jnp.zeros_like(x_m), jnp.zeros_like(y_m), jnp.ones_like(z_m)
     inverse = -jax.lax.rsqrt(x_m * x_m + y_m * y_m + z_m * z_m + _TINY)
     return x_m * inverse, y_m * inverse, z_m * inverse
 
@@ -40,7 +58,7 @@ def direction_to_eye(position_m: tuple[Float[Array, "*s"], ...]) -> tuple[Float[
 def surface_of(part: GBuffer) -> Surface:
     """What is lit, in the precision of the channels."""
     position_m = (part.positions.x_m, part.positions.y_m, part.positions.z_m)
-    to_eye = direction_to_eye(position_m)
+    to_eye = direction_to_eye(position_m, part.positions.is_parallel)
     return Surface(position_m, to_eye, part.normal, part.base_colour, part.specular, part.shininess)
 
 
@@ -62,7 +80,6 @@ def reflected(
     - `listed`: the light counts; else black.
     """
     x_m, y_m, z_m = surface.position_m
-    n_x, n_y, n_z = surface.normal
     to_x, to_y, to_z = light[..., 0] - x_m, light[..., 1] - y_m, light[..., 2] - z_m
     distance2 = to_x * to_x + to_y * to_y + to_z * to_z
     distance = jnp.sqrt(distance2)
@@ -70,21 +87,44 @@ def reflected(
     falloff = jnp.maximum(0, 1 - ratio2 * ratio2) ** 2
     # Masked here, once, and not in each of the three sums.
     falloff = jnp.where((falloff > light_cutoff) & listed, falloff, 0)
-    n_dot_to = jnp.maximum(n_x * to_x + n_y * to_y + n_z * to_z, 0)
+    n_dot_to, gloss = _facing(surface, (to_x, to_y, to_z), distance)
     # One division for the light's direction and its distance.
     lit = falloff * n_dot_to / (distance * jnp.maximum(distance2, MIN_DISTANCE2_M2) + _TINY)
+    if light.shape[-1] > POINT_COLUMNS:
+        along = -(to_x * light[..., 8] + to_y * light[..., 9] + to_z * light[..., 10])
+        cos_cone = along / (distance + _TINY)
+        lit = lit * jnp.clip((cos_cone - light[..., 12]) * light[..., 11], 0, 1)
+    return tuple(lit * light[..., 4 + c] * (base + gloss) for c, base in enumerate(surface.base_colour))
+
+
+def _facing(
+    surface: Surface, to: tuple[Float[Array, "*s"], ...], distance: Float[Array, "*s"] | float
+) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
+    """`max(0, n.l)` times the distance, and `specular * max(0, n.h)**shininess` of light that comes from `to`."""
+    n_x, n_y, n_z = surface.normal
+    to_x, to_y, to_z = to
+    n_dot_to = jnp.maximum(n_x * to_x + n_y * to_y + n_z * to_z, 0)
     # h = l / |l| + e, here times |l|. Only its angle counts, so that the root of |h| is spared:
     # (n.h / |h|)**s = ((n.h)**2 / h.h)**(s / 2).
     e_x, e_y, e_z = surface.to_eye
     h_x, h_y, h_z = to_x + e_x * distance, to_y + e_y * distance, to_z + e_z * distance
     n_dot_h = jnp.maximum(n_x * h_x + n_y * h_y + n_z * h_z, 0)
     cos2 = jnp.maximum(n_dot_h * n_dot_h / (h_x * h_x + h_y * h_y + h_z * h_z + _TINY), _TINY)
-    gloss = jnp.where(n_dot_h > 0, surface.specular * power(cos2, surface.shininess * 0.5), 0)
-    if light.shape[-1] > POINT_COLUMNS:
-        along = -(to_x * light[..., 8] + to_y * light[..., 9] + to_z * light[..., 10])
-        cos_cone = along / (distance + _TINY)
-        lit = lit * jnp.clip((cos_cone - light[..., 12]) * light[..., 11], 0, 1)
-    return tuple(lit * light[..., 4 + c] * (base + gloss) for c, base in enumerate(surface.base_colour))
+    return n_dot_to, jnp.where(n_dot_h > 0, surface.specular * power(cos2, surface.shininess * 0.5), 0)
+
+
+def reflected_suns(surface: Surface, shadows: LightShadows) -> tuple[Float[Array, "runs 32"], ...]:
+    """Light of all directional lights that a surface reflects towards the eye, where it is not in their shadow."""
+
+    def add(sun, sums):
+        row = shadows.slots.sun_row[sun]
+        n_dot_to, gloss = _facing(surface, (row[0], row[1], row[2]), 1.0)
+        lit = jnp.where(shadows.sun_lit(sun), n_dot_to, 0)
+        return tuple(s + lit * row[3 + c] * (surface.base_colour[c] + gloss) for c, s in enumerate(sums))
+
+    black = tuple(jnp.zeros_like(channel) for channel in surface.base_colour)
+    n_suns = shadows.slots.sun_row.shape[0]
+    return jax.lax.fori_loop(0, n_suns, add, black) if n_suns else black
 
 
 _CPU_SAMPLES_AT_ONCE = 4096
@@ -160,6 +200,8 @@ def shade(
     light_cutoff: Float[Array, ""],
     batch: int,
     transparent: bool = False,
+    shadows: LightShadows | None = None,
+    cluster_light: ClusterLight | None = None,
 ) -> Image:
     """Shade every valid sample with its cluster's lights: linear red, green and blue, 0 where invalid.
 
@@ -169,6 +211,8 @@ def shade(
     **Arguments:**
 
     - `transparent`: shade the transparent runs, and return those; else the solid ones, and return the visible.
+    - `shadows`: a light adds nothing where a sample lies in its shadow, and directional lights shine too.
+    - `cluster_light`: what is not on the lists but adds to all samples of a cluster.
     """
     capacity = clusters.block_run.shape[0]
     chunk = chunk_blocks(capacity, batch)
@@ -181,7 +225,7 @@ def shade(
     order = jnp.pad(longest_first(block_count, first_block, end_block), (0, chunk - 1))
     widths = _step_widths(chunk, capacity)
 
-    def add_lights(part, offset, count, k, sums, width, until):
+    def add_lights(part, shade_of, offset, count, k, sums, width, until):
         """Steps `k` to `until` of the first `width` blocks."""
         part, offset, count = jax.tree.map(lambda channel: channel[:width], (part, offset, count))
         surface = surface_of(part)
@@ -193,10 +237,14 @@ def shade(
             return k, sums
 
         def add_light(k, sums):
-            light = light_rows[lists.index[offset + k]][:, None, :]
+            index = lists.index[offset + k]
+            light = light_rows[index][:, None, :]
+            listed = (k < count)[:, None]
+            if shade_of is not None:
+                listed = listed & shade_of.lit(index)
             # Narrow channels are widened here and not before the loop: they are read at every step.
             widened = jax.tree.map(lambda channel: channel.astype(jnp.float32), surface)
-            added = reflected(widened, light, light_cutoff, (k < count)[:, None])
+            added = reflected(widened, light, light_cutoff, listed)
             return k + 1, tuple(s + a for s, a in zip(sums, added, strict=True))
 
         first_sums = tuple(s[:width] for s in sums)
@@ -211,11 +259,18 @@ def shade(
         offset, count = block_offset[block], jnp.where(in_use, block_count[block], 0)
         part = jax.tree.map(lambda channel: channel[run], gbuffer)
         sums = tuple(e.astype(jnp.float32) for e in part.emissive)
+        shade_of = shadows.of_runs(run) if shadows is not None else None
+        if shade_of is not None:
+            surface = jax.tree.map(lambda channel: channel.astype(jnp.float32), surface_of(part))
+            sums = tuple(s + a for s, a in zip(sums, reflected_suns(surface, shade_of), strict=True))
+        if cluster_light is not None:
+            once = cluster_light.reflected_by(part, clusters.block_cluster[block])
+            sums = tuple(s + a for s, a in zip(sums, once, strict=True))
         k = jnp.int32(0)
         for width, narrower in zip(widths, (*widths[1:], 0), strict=True):
             # Not the first one's length: very long lists are not in order among themselves.
             longest = jnp.max(count[narrower:width])
-            k, sums = add_lights(part, offset, count, k, sums, width, longest)
+            k, sums = add_lights(part, shade_of, offset, count, k, sums, width, longest)
         image = tuple(
             jax.lax.dynamic_update_slice(channel, s, (first, 0)) for channel, s in zip(image, sums, strict=True)
         )

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Bounds = Literal["explicit", "implicit"]
 Stencil = Literal["unlimited", "wrap", "saturate"]
+Tree = Literal["compact", "full"]
 
 
 class ShadowFrame(eqx.Module):
@@ -54,14 +55,17 @@ class ShadowPlan:
     """What is static in a shadow program: it fixes array shapes, or which tests there are.
 
     - `extra`: planes for rejection besides the four of a volume.
-    - `feedback`: triangles go on only into nodes that no triangle of the same or an earlier batch accepts: same mask,
-      fewer tests.
+    - `feedback`: triangles go on only into nodes that no triangle of the same or an earlier batch accepts, and with
+      batches not to samples that earlier ones shadow; those that block most of the light come first. Same mask, fewer
+      tests.
     - `batch`: triangles walked together, 0: all. Never changes the mask.
+    - `passes`: 1 or 2; `level`: where the first of two ends, counted from the root; 0: halfway down.
+    - `tree`: of cluster_hierarchy: over the occupied clusters, or over all cells, each at the place of its key.
     - `stencil`: of z-pass and z-fail: 8 bits that wrap or saturate, or no limit; `around_eye`: z-pass starts with the
       volumes
       around the eye, without which it fails where the camera stands in one.
-    - `clusters`, `groups`, `leaf_groups`: rounded capacities: of clusters and their blocks, of the lists of a level, of
-      the lists of tiles or clusters.
+    - `clusters`, `groups`, `leaf_groups`, `pairs`, `cells`: rounded capacities: of clusters and their blocks, of the
+      lists of a level, of the lists of tiles or clusters, of what goes on to a second pass, of the full tree.
     - `level_groups`: capacities of each level's lists. Then levels are unrolled and nothing loops, which suits a GPU;
       without them one loop runs over levels of `groups`, in chunks, which suits a CPU.
     """
@@ -72,23 +76,31 @@ class ShadowPlan:
     extra: Extra = "vertex"
     feedback: bool = True
     batch: int = 0
+    passes: int = 1
+    level: int = 0
+    tree: Tree = "compact"
     stencil: Stencil = "unlimited"
     around_eye: bool = True
     clusters: int = 0
     groups: int = 0
     leaf_groups: int = 0
+    pairs: int = 0
+    cells: int = 0
     level_groups: tuple[int, ...] = ()
 
 
 class ShadowCounts(eqx.Module):
     """What a walk did, 64 bits; one entry a level of nodes, the root's children first.
 
-    - `node_tests`: (existing child, triangle) pairs tested; `accepted`, `refined`: of these; the rest is rejected.
+    - `node_tests`: (existing child, triangle) pairs tested; `accepted`, `refined`: of these; `dropped`: what would be
+      refined, into children that lie in shadow; the rest is rejected.
     - `extra_plane_tests`: pairs that neither the four planes reject nor accept, which the extra planes then test.
     - `sample_tests`: (valid sample, triangle) pairs at the leaves, all samples of the tile, as the papers test;
-      `sample_tests_in_cluster`: only those of the cluster itself.
+      `sample_tests_in_cluster`: only those of the cluster itself; `dropped_samples`: pairs spared by feedback.
     - `stencil_updates`: (sample, polygon) pairs that change a stencil; -1 for algorithms without one.
-    - `groups`: groups of each level's lists, the leaves' last: what the capacities must hold.
+    - `tests_of_triangle`: of nodes and samples (of a stencil: by polygon).
+    - `groups`: groups of each level's lists, the leaves' last: what the capacities must hold; `n_pairs`: pairs that go
+      on to a second pass, likewise.
     - `list_length`: triangles tested against each tile or cluster.
     - `n_items`: occupied tiles or clusters; `n_blocks`: what `clusters` must hold.
     - `n_casters`: triangles with a volume.
@@ -97,11 +109,15 @@ class ShadowCounts(eqx.Module):
     node_tests: Int[Array, " levels"]
     accepted: Int[Array, " levels"]
     refined: Int[Array, " levels"]
+    dropped: Int[Array, " levels"]
     extra_plane_tests: Int[Array, " levels"]
     sample_tests: Int[Array, ""]
     sample_tests_in_cluster: Int[Array, ""]
+    dropped_samples: Int[Array, ""]
     stencil_updates: Int[Array, ""]
+    tests_of_triangle: Int[Array, " triangles"]
     groups: Int[Array, " levels_and_1"]
+    n_pairs: Int[Array, ""]
     list_length: Int[Array, " items"]
     n_items: Int[Array, ""]
     n_blocks: Int[Array, ""]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from vtfs.cluster_grid import cluster_grid
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
+from vtfs.parameters import Configuration
 from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight
 from vtfs.shadow_mask import (
     ShadowFrame,
@@ -24,14 +25,16 @@ from vtfs.shadow_mask import (
     shadow_frame,
 )
 from vtfs.shadow_volumes.cluster_hierarchy import cluster_hierarchy
+from vtfs.shadow_volumes.full_tree import n_cells
+from vtfs.shadow_volumes.levels import LANES, LEAF_LANES
 from vtfs.shadow_volumes.ptsv import ptsv
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
-from vtfs.shadow_volumes.walk import LANES, LEAF_LANES
 from vtfs.shadow_volumes.z_fail import z_fail
 from vtfs.shadow_volumes.z_pass import z_pass
 from vtfs.view_samples import ViewSamples
 
 if TYPE_CHECKING:
+    from vtfs.camera import Camera
     from vtfs.cluster_grid import ClusterGrid
 
 log = logging.getLogger("vtfs.shadows")
@@ -46,6 +49,36 @@ SHADOW_TECHNIQUES: dict[str, ShadowTechnique] = {
 }
 """Shadow techniques of one signature. What differs from one plan to another is in the plan."""
 
+
+def shadow_plan(config: Configuration) -> ShadowPlan:
+    """The static part of a configuration of a shadow technique, without capacities."""
+    params = config.params
+    extra = "silhouette" if config.technique == "ptsv" else "vertex"
+    return ShadowPlan(
+        tile_px=int(params.get("tile_px", 8)),
+        branching=int(params.get("branching", 32)),
+        bounds=params.get("bounds", "explicit"),  # type: ignore[arg-type]
+        extra=extra if params.get("planes", "off") == "on" else "off",
+        feedback=params.get("feedback") == "on",
+        batch=int(params.get("batch", 0)),
+        stencil=params.get("stencil", "unlimited"),  # type: ignore[arg-type]
+        around_eye=params.get("around_eye") == "on",
+    )
+
+
+def shadow_sizes(plan: ShadowPlan) -> tuple[int, ...]:
+    """The capacities of a plan, as numbers of which the larger one holds more."""
+    return plan.clusters, plan.groups, plan.leaf_groups, *plan.level_groups
+
+
+def with_shadow_sizes(plan: ShadowPlan, sizes: tuple[int, ...]) -> ShadowPlan:
+    """The plan with such capacities; none where they are not known yet."""
+    if not sizes:
+        return plan
+    clusters, groups, leaf_groups, *level_groups = sizes
+    return replace(plan, clusters=clusters, groups=groups, leaf_groups=leaf_groups, level_groups=tuple(level_groups))
+
+
 _FIRST = ShadowPlan(clusters=2**12, groups=2**10, leaf_groups=2**13)
 _LARGEST = 2**26
 
@@ -56,8 +89,12 @@ def shadow_grid(samples: ViewSamples, tile_px: int, depth_slices: int = 0) -> Cl
     **Raises:** `InputError` where it has more columns, rows or slices than keys can tell apart.
     """
     depths = -samples.position_m[..., 2][samples.valid]
-    deepest_m = float(depths.max(initial=samples.camera.near_m))
-    grid = cluster_grid(samples.camera, tile_px, depth_slices, deepest_m)
+    return grid_of(samples.camera, float(depths.max(initial=samples.camera.near_m)), tile_px, depth_slices)
+
+
+def grid_of(camera: Camera, deepest_m: float, tile_px: int, depth_slices: int) -> ClusterGrid:
+    """The same, of a camera whose deepest sample is known."""
+    grid = cluster_grid(camera, tile_px, depth_slices, deepest_m)
     n_slices = int(grid.depth_slices)
     if n_slices > 2**KEY_BITS:
         raise InputError(
@@ -104,40 +141,58 @@ def _rounded_up(name: str, needed: int, first: int) -> int:
     return max(first, 1 << (max(needed, 1) - 1).bit_length())
 
 
-def fitted(
-    technique: str,
-    plan: ShadowPlan,
-    frame: ShadowFrame,
-    unrolled: bool | None = None,
-    run: Callable[[str, ShadowPlan, ShadowFrame], ShadowMask] = run_program,
-) -> ShadowPlan:
+def fitted(technique: str, plan: ShadowPlan, frame: ShadowFrame, unrolled: bool | None = None) -> ShadowPlan:
     """The plan with capacities that hold a frame, found by running it.
 
     **Arguments:**
 
     - `unrolled`: without loops, each level with its own capacity; unless given, where the device is no CPU.
+    """
+    return fitted_to_all(technique, plan, [frame], unrolled)[0]
+
+
+def fitted_to_all(
+    technique: str,
+    plan: ShadowPlan,
+    frames: Sequence[ShadowFrame],
+    unrolled: bool | None = None,
+    run: Callable[[str, ShadowPlan, ShadowFrame], ShadowMask] = run_program,
+) -> tuple[ShadowPlan, list[ShadowMask]]:
+    """The plan with capacities that hold all of several frames, and their masks; see `fitted`.
+
+    **Arguments:**
+
     - `run`: the program to fit, if it is another one over the same tree.
     """
-    n_samples = int(np.prod(frame.receives.shape))
+    n_samples = int(np.prod(frames[0].receives.shape))
+    n_triangles = frames[0].triangles.shape[0]
+    viewport = frames[0].positions.viewport
+    if plan.tree == "full":
+        columns, rows = -(-viewport.width_px // plan.tile_px), -(-viewport.height_px // plan.tile_px)
+        n_slices = max(int(frame.grid.depth_slices) for frame in frames)
+        plan = replace(plan, cells=n_cells(columns, rows, n_slices, plan.branching))
     plan = replace(
         plan,
         clusters=plan.clusters or _rounded_up("clusters", n_samples // 8, _FIRST.clusters),
-        groups=plan.groups or _rounded_up("lists", 2 * frame.triangles.shape[0], _FIRST.groups),
+        groups=plan.groups or _rounded_up("lists", 2 * n_triangles, _FIRST.groups),
         leaf_groups=plan.leaf_groups or _rounded_up("leaf lists", n_samples // 8, _FIRST.leaf_groups),
+        pairs=plan.pairs or (_rounded_up("pairs", 4 * n_triangles, 2**10) if plan.passes == 2 else 0),
         level_groups=(),
     )
     while True:
-        mask = run(technique, plan, frame)
-        needed = np.asarray(mask.counts.groups).astype(np.int64)
-        if not bool(mask.overflowed):
+        masks = [run(technique, plan, frame) for frame in frames]
+        needed = np.max([np.asarray(mask.counts.groups) for mask in masks], axis=0).astype(np.int64)
+        if not any(bool(mask.overflowed) for mask in masks):
             break
-        n_blocks = int(mask.counts.n_blocks)
+        n_blocks = max(int(mask.counts.n_blocks) for mask in masks)
+        n_pairs = max(int(mask.counts.n_pairs) for mask in masks)
         grown = replace(plan, clusters=_rounded_up("clusters", n_blocks, plan.clusters))
         if n_blocks <= plan.clusters:  # else the lists are meaningless
             grown = replace(
                 grown,
                 groups=_rounded_up("lists", _more(needed[:-1].max(), plan.groups), plan.groups),
                 leaf_groups=_rounded_up("leaf lists", _more(needed[-1], plan.leaf_groups), plan.leaf_groups),
+                pairs=_rounded_up("pairs", n_pairs, plan.pairs) if plan.pairs else 0,
             )
         log.info("%s: %s does not fit, trying %s", technique, plan, grown)
         if grown == plan:
@@ -148,7 +203,7 @@ def fitted(
         leaf_groups = _rounded_up("leaf lists", int(needed[-1]), 2**6)
         if levels:
             plan = replace(plan, level_groups=levels, leaf_groups=leaf_groups, groups=0)
-    return plan
+    return plan, masks
 
 
 def _more(needed: np.integer, capacity: int) -> int:
@@ -221,21 +276,25 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
       papers. `test_and_set_in_cluster` counts there only the samples of the cluster itself. With a stencil: one for
       each
       sample and volume polygon that passes (z_pass) or fails (z_fail) the depth test; what the tiles cost stays apart.
-    - `node_tests_0` ...: of them, on each level below the root; `accepted_*`, `refined_*` likewise, the others are
-      rejected.
+    - `node_tests_0` ...: of them, on each level below the root; `accepted_*`, `refined_*`, `dropped_*` likewise, the
+      others are rejected. `dropped_nodes`, `dropped_samples`: pairs that feedback spares.
+    - `tests_of_largest`: of the 1,024 triangles with the most tests: how unevenly the work lies.
     - `extra_plane_tests`: planes tested beyond the four of a volume.
     - `memory`: bytes of the structures at their capacities.
     """
     counts = mask.counts
-    nodes, accepted, refined, extra = (
+    nodes, accepted, refined, dropped, extra = (
         np.asarray(column).astype(np.int64)
-        for column in (counts.node_tests, counts.accepted, counts.refined, counts.extra_plane_tests)
+        for column in (counts.node_tests, counts.accepted, counts.refined, counts.dropped, counts.extra_plane_tests)
     )
     per_level = {
         f"{name}_{level}": int(value)
-        for name, column in (("node_tests", nodes), ("accepted", accepted), ("refined", refined))
+        for name, column in (
+            ("node_tests", nodes), ("accepted", accepted), ("refined", refined), ("dropped", dropped)
+        )
         for level, value in enumerate(column)
-    }
+    }  # fmt: skip
+    of_triangle = np.sort(np.asarray(counts.tests_of_triangle).astype(np.int64))
     updates = int(counts.stencil_updates)
     on_nodes = int(nodes.sum())
     lengths = np.asarray(counts.list_length).astype(np.int64)
@@ -248,6 +307,9 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
         "node_tests": on_nodes,
         "sample_tests": int(counts.sample_tests),
         "extra_plane_tests": 3 * int(extra.sum()),
+        "dropped_nodes": int(dropped.sum()),
+        "dropped_samples": int(counts.dropped_samples),
+        "tests_of_largest": int(of_triangle[-1_024:].sum()),
         "longest_list": int(lengths.max(initial=0)),
         "listed_pairs": int(lengths.sum()),
         "memory": _memory(plan, frame),
@@ -255,12 +317,26 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
     }
 
 
+def shadows_counts(of_each: Sequence[dict[str, int]]) -> dict[str, int]:
+    """Counts of the shadows of several lights and views: sums, but what is held or longest is that of the largest.
+
+    Names that shading has too are told apart: `shadow_samples` receive shadow, `shadow_clusters` are what is walked.
+    """
+    largest = {"memory", "longest_list", "casters"}
+    total = {
+        name: (max if name in largest else sum)(counts.get(name, 0) for counts in of_each)
+        for name in dict.fromkeys(name for counts in of_each for name in counts)
+    }
+    names = {"samples": "shadow_samples", "items": "shadow_clusters", "longest_list": "longest_shadow_list"}
+    return {names.get(name, name): value for name, value in total.items()}
+
+
 def _memory(plan: ShadowPlan, frame: ShadowFrame) -> int:
     """Lists of all levels that are held at once, planes of all triangles, and the tree."""
     groups = sum(plan.level_groups) if plan.level_groups else 2 * plan.groups
     lists = 4 * (LANES * groups + LEAF_LANES * plan.leaf_groups) + 12 * plan.branching * groups
     planes = frame.triangles.shape[0] * (8 * 13 + 4 * (13 + (9 if plan.extra != "off" else 0)))
-    n_items = plan.clusters or int(np.prod(frame.receives.shape)) // plan.tile_px**2
+    n_items = plan.cells or plan.clusters or int(np.prod(frame.receives.shape)) // plan.tile_px**2
     tree = 24 * n_items * plan.branching // (plan.branching - 1)
     samples = 16 * int(np.prod(frame.receives.shape))
     return lists + planes + tree + samples

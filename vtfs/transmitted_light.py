@@ -16,7 +16,7 @@ from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight
 from vtfs.shadow_mask import ShadowFrame, ShadowPlan, casters_on_device, shadow_frame
-from vtfs.shadow_techniques import CastShadows, cast_shadows, fitted, on_host, shadow_grid
+from vtfs.shadow_techniques import CastShadows, cast_shadows, fitted_to_all, on_host, shadow_grid
 from vtfs.shadow_volumes.transmittance import Transmitted, transmit
 from vtfs.view_samples import ViewSamples
 
@@ -107,7 +107,7 @@ def transmitted_light(
         with jax.enable_x64(True):
             return alpha_program(technique, plan, blending)(frame, surfaces, jnp.asarray(words))
 
-    plan = fitted(technique, plan, frame, run=lambda _technique, plan, _frame: found(plan).mask)
+    plan, _ = fitted_to_all(technique, plan, [frame], run=lambda _technique, plan, _frame: found(plan).mask)
     transmitted = found(plan)
     alpha = on_host(transmitted.mask, plan, frame)
     stopped = opaque.shadowed | alpha.shadowed

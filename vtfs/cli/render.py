@@ -33,7 +33,8 @@ def render(
 ) -> None:
     """Image, heat map of lighting computations, and the technique's cells as PNG.
 
-    Of techniques with cells also: clusters in random colours, depth slices, and lights listed in vain.
+    Of techniques with cells also: clusters in random colours, depth slices, and lights listed in vain. Of shadow
+    techniques also: the shadows, and the triangles that each pixel is tested against.
     """
     set_log_level(verbose)
     config = parsed_configuration(technique, settings)
@@ -41,20 +42,21 @@ def render(
     setup = scene.set_up()
     from vtfs.cell_maps import cell_maps
     from vtfs.device import keep_compiled_programs
-    from vtfs.frame import FrameInputs
     from vtfs.frame import count as count_frame
     from vtfs.frame import render as render_frame
     from vtfs.image import exposure, heat_map, random_colours, tone_map, write_png
+    from vtfs.shadow_maps import shadow_maps
 
     keep_compiled_programs()
     written: list[dict[str, Any]] = []
     for number in dict.fromkeys(frame or [0]):
         with Status() as status:
             status.say(f"frame {number}")
-            inputs = FrameInputs(setup.samples(number), setup.lights)
+            inputs = setup.inputs(number)
             image = render_frame(config, inputs)
             _, lengths = count_frame(config, inputs)
             maps = cell_maps(config, inputs)
+            shadows = shadow_maps(config, inputs)
         seen, solid = inputs.seen(), inputs.samples.valid
         largest = int(lengths.of_sample.max(initial=0))
         mean = float(lengths.of_sample[seen].mean()) if seen.any() else 0.0
@@ -76,6 +78,21 @@ def render(
                     f"{maps.listed_per_reaching:.2f} listed for one that reaches",
                 ),
             }
+        if shadows is not None:
+            most = int(shadows.tests.max(initial=0))
+            n_lit = int(shadows.lit.sum())
+            pictures["shadow_mask"] = (
+                heat_map(shadows.shadowed, len(inputs.shadows.lights), solid),
+                f"lights that each pixel lies in the shadow of: {shadows.shadowed.sum() / max(n_lit, 1):.1%} of what "
+                "they would light",
+            )
+            if most:
+                mean = float(shadows.tests[solid].mean()) if solid.any() else 0.0
+                pictures["shadow_tests"] = (
+                    heat_map(shadows.tests, most, solid),
+                    f"triangles that each pixel's tile or cluster is tested against: {mean:.1f} in the mean, at most "
+                    f"{most}",
+                )
         paths = {kind: out / f"{_FILE_NAMES.get(kind, kind)}_{technique}_{number:04d}.png" for kind in pictures}
         for kind, (pixels, caption) in pictures.items():
             write_png(paths[kind], pixels)

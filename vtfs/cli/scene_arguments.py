@@ -1,4 +1,4 @@
-"""The scene of a command: nine options that every command on a scene has."""
+"""The scene of a command: ten options that every command on a scene has."""
 
 from __future__ import annotations
 
@@ -63,6 +63,16 @@ class SceneArguments:
             rich_help_panel=_PANEL,
         ),
     ] = "constant"
+    shadow_lights: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=32,
+            help="Shadow techniques: lights that cast on each frame, those that light it most; directional lights "
+            "cast besides.",
+            rich_help_panel=_PANEL,
+        ),
+    ] = 1
     triangles: Annotated[
         int | None, typer.Option(help="Size of a built-in scene, 1,000 to 1,000,000 triangles.", rich_help_panel=_PANEL)
     ] = None
@@ -87,6 +97,7 @@ class SceneArguments:
                 self.lights_per_sample,
                 self.density,  # type: ignore[arg-type]
                 self.triangles,
+                self.shadow_lights,
             )
         )
 

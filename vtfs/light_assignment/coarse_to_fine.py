@@ -7,17 +7,23 @@ reduction a level, of clusters that are few, instead of codes, a sort and boxes 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from vtfs.bit_lists import WORD_BITS, last_not_above, list_bits, pack_bits, starts_of
-from vtfs.bounds import Aabb, Sphere, sphere_meets_box
+from vtfs.bounds import Aabb, Cone, Sphere, sphere_meets_box
 from vtfs.clusters import Clusters
+from vtfs.light_culling import Cull, may_reach
 from vtfs.light_lists import AssignCounts, LightLists
 from vtfs.wide_tree import build_tree, in_leaf_nodes, n_leaf_nodes
+
+GROUP = 32
+"""Clusters of a group, where nothing says otherwise."""
 
 _WHOLE = 2**21
 """Words of a level that are tested in one step on a GPU, whatever the chunk."""
@@ -47,13 +53,23 @@ class Blocks(eqx.Module):
     total: Int[Array, ""]
 
 
+Keep = Callable[[Int[Array, " rows"], Sphere, Cone | None], Bool[Array, "rows 32"]]
+
+
 def assign_coarse_to_fine(
-    lights: Sphere, clusters: Clusters, capacity: int, chunk: int, branching: int = 32
+    lights: Sphere,
+    clusters: Clusters,
+    capacity: int,
+    chunk: int,
+    branching: int = GROUP,
+    cull: Cull = "box",
+    cones: Cone | None = None,
 ) -> tuple[LightLists, AssignCounts]:
     """Refine the list of all lights to lists of groups of `branching` consecutive clusters, and those to clusters.
 
     Clusters are in order of their keys, so that a group is a piece of a row of tiles. Any boxes will do. Lights are
-    listed in ascending order.
+    listed in ascending order. Groups are tested by their boxes, so that `cull` must be one that lets no light pass
+    whose sphere misses the cluster's box: `box` or `frustum`.
 
     **Arguments:**
 
@@ -71,7 +87,11 @@ def assign_coarse_to_fine(
     everyone = jnp.arange(n_words * WORD_BITS, dtype=jnp.int32)
     lists = NodeLists(everyone, jnp.zeros(1, jnp.int32), jnp.full(1, n_lights, jnp.int32))
     # Places past the lights are read by lanes that are masked.
-    lights = jax.tree.map(lambda column: jnp.pad(column, (0, n_words * WORD_BITS - n_lights)), lights)
+    lights, cones = jax.tree.map(lambda column: jnp.pad(column, (0, n_words * WORD_BITS - n_lights)), (lights, cones))
+    culls_more = cull != "box" or cones is not None or clusters.cones is not None
+
+    def keep(cluster, sphere, cone):
+        return may_reach(sphere, cone, clusters, cluster, cull, "sphere")
 
     overflowed, words, absent, held = jnp.bool_(False), [], [], n_words * WORD_BITS
     for depth, boxes in enumerate(levels):
@@ -86,7 +106,10 @@ def assign_coarse_to_fine(
         absent.append(jnp.sum(n_children * (blocks.count * WORD_BITS - count), dtype=jnp.int32))
         room = capacity if depth == len(levels) - 1 else max(capacity // _COARSE_SHARE, WORD_BITS)
         most_blocks = held // WORD_BITS + boxes.shape[0]
-        lists, total = refine(lights, lists, blocks, boxes, most_blocks, room, chunk)
+        if depth == len(levels) - 1 and culls_more:
+            lists, total = refine(lights, lists, blocks, boxes, most_blocks, room, chunk, cones, keep)
+        else:
+            lists, total = refine(lights, lists, blocks, boxes, most_blocks, room, chunk)
         overflowed |= total > room
         held = room
     n = clusters.key.shape[0]
@@ -126,15 +149,21 @@ def refine(
     most_blocks: int,
     capacity: int,
     chunk: int,
+    cones: Cone | None = None,
+    keep: Keep | None = None,
 ) -> tuple[NodeLists, Int[Array, ""]]:
     """Lists of the children from those of their parents.
 
     Lights are loaded once for all children of a node: loading costs a CPU more than testing.
 
+    **Arguments:**
+
+    - `keep`: a further test of each child (numbered through all nodes) against 32 lights that meet its box.
+
     **Returns:** the children's lists, and their total length, also where it is more than `capacity`.
     """
     branching = boxes.shape[2]
-    hits = _test_blocks(lights, lists, blocks, boxes, most_blocks, chunk)
+    hits = _test_blocks(lights, lists, blocks, boxes, most_blocks, chunk, cones, keep)
 
     def words_of(row):
         """Row after row: the children of a node, the blocks of a child."""
@@ -168,6 +197,8 @@ def _test_blocks(
     boxes: Float[Array, "nodes 6 branching"],
     most_blocks: int,
     chunk: int,
+    cones: Cone | None,
+    keep: Keep | None,
 ) -> UInt32[Array, "blocks branching"]:
     """Which lights of each block meet each child of its node: bit `l` for the `l`-th light."""
     branching = boxes.shape[2]
@@ -180,12 +211,16 @@ def _test_blocks(
         light = lists.light[jnp.where(there, (lists.offset[node] + before)[:, None] + lane, 0)]
         light = jnp.where(there, light, 0)
         # Loaded before, not within, the tests: a GPU would load each light again for every child.
-        sphere = jax.lax.optimization_barrier(jax.tree.map(lambda column: column[light], lights))
-        sphere = jax.tree.map(lambda column: column[:, None, :], sphere)
+        loaded = jax.lax.optimization_barrier(jax.tree.map(lambda column: column[light], (lights, cones)))
+        sphere, _ = jax.tree.map(lambda column: column[:, None, :], loaded)
         box = boxes[node]
-        return pack_bits(
-            there[:, None, :] & sphere_meets_box(sphere, Aabb(*(box[:, c, :, None] for c in range(6))))
-        ).reshape(-1, branching)
+        meets = there[:, None, :] & sphere_meets_box(sphere, Aabb(*(box[:, c, :, None] for c in range(6))))
+        if keep is not None:
+            # One row a child, as `may_reach` has them.
+            of_child = jax.tree.map(lambda column: jnp.repeat(column, branching, axis=0), loaded)
+            child = node[:, None] * branching + jnp.arange(branching)
+            meets &= keep(child.reshape(-1), *of_child).reshape(meets.shape)
+        return pack_bits(meets).reshape(-1, branching)
 
     if jax.default_backend() != "cpu" and most_blocks * branching <= max(chunk, _WHOLE):
         return test(jnp.arange(most_blocks, dtype=jnp.int32))

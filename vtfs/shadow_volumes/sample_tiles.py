@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt64
+from jaxtyping import Array, Bool, Float, Int, UInt32, UInt64
 
 from vtfs.bit_lists import WORD_BITS, bits_below, n_bits_set, pack_bits, set_bits, starts_of
 from vtfs.bounds import Aabb
@@ -150,19 +151,20 @@ def depth_parts(samples: SampleTiles, grid: ClusterGrid) -> Aabb:
 class SampleClusters(eqx.Module):
     """Occupied clusters in Morton order of column, row and slice.
 
-    - `tile`: of each cluster; `box`: empty boxes beyond `n_clusters`.
+    - `tile`, `slice_k`: of each cluster; `box`: empty boxes beyond `n_clusters`.
     - `of_sample`: cluster of each sample; meaningless where it receives nothing.
-    - `n_samples`: of each cluster.
+    - `members`: bits of each cluster's samples among those of its tile.
     - `n_blocks`: parts of rows of 32 samples that lie in one cluster. Where they are more than the capacity, the rest
       is
       meaningless.
     """
 
     tile: Int[Array, " capacity"]
+    slice_k: Int[Array, " capacity"]
     box: Aabb
     n_clusters: Int[Array, ""]
     of_sample: Int[Array, "tiles lanes"]
-    n_samples: Int[Array, " capacity"]
+    members: UInt32[Array, "capacity words"]
     n_blocks: Int[Array, ""]
 
 
@@ -196,7 +198,9 @@ def sample_clusters(samples: SampleTiles, grid: ClusterGrid, explicit: bool, cap
     tile, slice_k = row // (lanes // width), key[row, lane]
     code = _spread(tile % samples.columns) | _spread(tile // samples.columns) << 1 | _spread(slice_k) << 2
     largest = jnp.uint64(2**64 - 1)
-    sorted_code = jnp.sort(jnp.where(in_use, code << _PLACE_BITS | place.astype(jnp.uint64), largest))
+    # No two are equal where it matters: a stable sort would carry their places too.
+    keyed = jnp.where(in_use, code << _PLACE_BITS | place.astype(jnp.uint64), largest)
+    sorted_code = jax.lax.sort(keyed, is_stable=False)
     block = jnp.where(in_use, (sorted_code & jnp.uint64(2**_PLACE_BITS - 1)).astype(jnp.int32), 0)
     code = sorted_code >> _PLACE_BITS
     first = (code != jnp.concatenate([jnp.full(1, largest), code[:-1]])) & in_use
@@ -204,33 +208,30 @@ def sample_clusters(samples: SampleTiles, grid: ClusterGrid, explicit: bool, cap
     n_clusters = jnp.max(cluster, initial=-1) + 1
     cluster_of_block = jnp.zeros(capacity, jnp.int32).at[jnp.where(in_use, block, capacity)].set(cluster, mode="drop")
 
-    # Boxes: each block's own first, then of the blocks of a cluster, which are consecutive.
+    # What each cluster is, from its first block; its members and bounds from all its blocks.
     row, slice_k = row[block], slice_k[block]
     together = (key[row] == slice_k[:, None]) & receives[row] & in_use[:, None]
-    n_in_block = jnp.sum(together, axis=1, dtype=jnp.int32)
-    leads_at = jnp.where(first, cluster, capacity)
-    first_block = jnp.full(capacity + 1, capacity, jnp.int32).at[leads_at].set(place, mode="drop")
-    n_used = jnp.minimum(n_blocks, capacity)
-    first_block = jnp.minimum(first_block, n_used)
-    sums = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(n_in_block, dtype=jnp.int32)])
-    n_samples = sums[first_block[1:]] - sums[first_block[:-1]]
-    cluster_tile = tile[block][jnp.minimum(first_block[:-1], capacity - 1)]
-    exists = place < n_clusters
+    leads_at, belongs_to = jnp.where(first, cluster, capacity), jnp.where(in_use, cluster, capacity)
+    cluster_tile, cluster_slice = (
+        jnp.zeros(capacity, jnp.int32).at[leads_at].set(values, mode="drop") for values in (tile[block], slice_k)
+    )
+    words = lanes // width
+    members = jnp.zeros((capacity, words), jnp.uint32)
+    members = members.at[belongs_to, row % words].add(pack_bits(together)[:, 0], mode="drop")
     if explicit:
-        target = jnp.where(in_use, cluster, capacity)
-        bounds = [_extent(rows(c)[row], together, target) for c in (samples.x_m, samples.y_m, samples.z_m)]
-        box = Aabb(*(low for low, _ in bounds), *(high for _, high in bounds))
+        extents = [_extent(rows(c)[row], together) for c in (samples.x_m, samples.y_m, samples.z_m)]
+        extents = jnp.stack([low for low, _ in extents] + [-high for _, high in extents], axis=1)
+        bounds = jnp.full((capacity, 6), jnp.inf, jnp.float32).at[belongs_to].min(extents, mode="drop")
+        box = Aabb(*(bounds[:, c] for c in range(3)), *(-bounds[:, c] for c in range(3, 6)))
     else:
-        at = slice_k[jnp.minimum(first_block[:-1], capacity - 1)]
-        box = cell_boxes(grid, samples.viewport, _cell_key(grid, samples, cluster_tile, at))
+        box = cell_boxes(grid, samples.viewport, _cell_key(grid, samples, cluster_tile, cluster_slice))
+        exists = place < n_clusters
         box = Aabb(
             *(jnp.where(exists, c, jnp.inf) for c in (box.low_x_m, box.low_y_m, box.low_z_m)),
             *(jnp.where(exists, c, -jnp.inf) for c in (box.high_x_m, box.high_y_m, box.high_z_m)),
         )
     of_sample = cluster_of_block[jnp.minimum(block_of_sample, capacity - 1)].reshape(n_tiles, lanes)
-    return SampleClusters(
-        jnp.where(exists, cluster_tile, 0), box, n_clusters, of_sample, jnp.where(exists, n_samples, 0), n_blocks
-    )
+    return SampleClusters(cluster_tile, cluster_slice, box, n_clusters, of_sample, members, n_blocks)
 
 
 _PLACE_BITS = 64 - 3 * KEY_BITS
@@ -254,14 +255,11 @@ def _cell_key(grid: ClusterGrid, samples: SampleTiles, tile: Int[Array, "*n"], s
     return (slice_k * samples.rows + tile // samples.columns) * samples.columns + tile % samples.columns
 
 
-def _extent(value: Array, together: Array, cluster: Array) -> tuple[Array, Array]:
-    """Least and greatest value over the samples of each cluster."""
-    infinite = jnp.full(cluster.shape, jnp.inf, jnp.float32)
-    low = jnp.min(jnp.where(together, value, jnp.inf), axis=1)
-    high = jnp.max(jnp.where(together, value, -jnp.inf), axis=1)
+def _extent(value: Array, together: Array) -> tuple[Array, Array]:
+    """Least and greatest value over the samples of each block."""
     return (
-        infinite.at[cluster].min(low, mode="drop"),
-        (-infinite).at[cluster].max(high, mode="drop"),
+        jnp.min(jnp.where(together, value, jnp.inf), axis=1),
+        jnp.max(jnp.where(together, value, -jnp.inf), axis=1),
     )
 
 

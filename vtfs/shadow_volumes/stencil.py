@@ -19,6 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 from vtfs.bounds import Aabb
 from vtfs.gbuffer import Positions
 from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
+from vtfs.shadow_volumes.hierarchy import Hierarchy, node_table
+from vtfs.shadow_volumes.merge import mask_of
 from vtfs.shadow_volumes.planes import (
     BELOW_ZERO,
     SMALLEST_VOLUME,
@@ -37,8 +39,10 @@ from vtfs.shadow_volumes.planes import (
     times,
     unit,
 )
-from vtfs.shadow_volumes.sample_tiles import SampleTiles, in_runs, sample_tiles, tile_order
-from vtfs.shadow_volumes.walk import Volumes, Walk, count_volumes, mask_of, node_table, rotated
+from vtfs.shadow_volumes.ptsv import over_tiles
+from vtfs.shadow_volumes.sample_tiles import SampleTiles, sample_tiles, tile_order
+from vtfs.shadow_volumes.volumes import Volumes, light_m, origin_m, rotated
+from vtfs.shadow_volumes.walk import Walk, count_volumes
 
 
 class Polygons(eqx.Module):
@@ -54,53 +58,81 @@ class Polygons(eqx.Module):
     crossing: Int[Array, " polygons"]
 
 
-def stencil_mask(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> ShadowMask:
-    """Shadows by counting the polygons before each sample (z-pass) or behind it (z-fail).
+class StencilPolygons(eqx.Module):
+    """All polygons of all volumes.
 
-    Samples are moved toward the light by the bias.
+    - `casts`: triangles that have a volume; `around_eye`: volumes that hold the eye.
     """
+
+    polygons: Polygons
+    casts: Bool[Array, " triangles"]
+    around_eye: Int[Array, ""]
+
+
+class StencilWalk(eqx.Module):
+    """How often a line from the eye to each sample of each item enters and leaves volumes, and what it took."""
+
+    entered: Int[Array, "items lanes"]
+    left: Int[Array, "items lanes"]
+    walk: Walk
+
+
+def stencil_mask(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> ShadowMask:
+    """Shadows by counting the polygons before each sample (z-pass) or behind it (z-fail)."""
+    polygons, hierarchy = shadow_planes(frame, plan, by_failing), shadow_build(frame, plan)
+    return shadow_merge(polygons, hierarchy, shadow_traverse(polygons, hierarchy, plan, by_failing), plan, by_failing)
+
+
+def shadow_planes(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> StencilPolygons:
+    """Sides and, by failing, caps of all volumes, relative to the eye."""
     origin = frame.eye_m
     vertex = rotated(frame, tuple(c - origin[k] for k, c in enumerate(frame.vertex_m)))
-    light = rotated(frame, tuple(frame.light_m if frame.directional else frame.light_m - origin))
-    zero = jnp.float64(0)
-    apex = tuple(jnp.zeros(3, jnp.float64)) if frame.directional else light
+    light, apex, zero = light_m(frame), origin_m(frame), jnp.float64(0)
     about_light = tuple(c - o for c, o in zip(vertex, apex, strict=True))
     planes, inward = edge_planes(about_light, frame.triangles, light, frame.directional, zero, frame.culls_front)
     polygons = _polygons(frame, vertex, light, apex, inward, by_failing)
     around_eye = jnp.sum(inside(planes, tuple(-o for o in apex), zero), dtype=jnp.int32)
+    return StencilPolygons(polygons, inward != 0, around_eye)
 
-    samples = sample_tiles(_moved(frame, light), frame.receives, plan.tile_px)
-    tile, place_of = tile_order(samples.columns, samples.rows)
+
+def shadow_build(frame: ShadowFrame, plan: ShadowPlan) -> Hierarchy:
+    """Tiles of the samples, each moved toward the light by the bias, in boxes."""
+    samples = sample_tiles(_moved(frame, light_m(frame)), frame.receives, plan.tile_px)
+    tile, _ = tile_order(samples.columns, samples.rows)
     table = node_table(_tile_boxes(samples, tile), plan.branching, is_frustum=False)
-    tiles = jnp.asarray(np.maximum(tile, 0))
+    return over_tiles(samples, table, is_frustum=False)
+
+
+def shadow_traverse(polygons: StencilPolygons, hierarchy: Hierarchy, plan: ShadowPlan, by_failing: bool) -> StencilWalk:
+    """Walk the polygons down the tree of tiles and count those before, or behind, each sample."""
     plain = replace(plan, feedback=False, extra="off", batch=0)
 
     def count(crossing: Array) -> tuple[Array, Walk]:
-        volume = _seen_volumes(polygons, polygons.crossing == crossing, by_failing)
-        return count_volumes(volume, table, samples, tiles, plain)
+        drawn = polygons.polygons.crossing == crossing
+        return count_volumes(_seen_volumes(polygons.polygons, drawn, by_failing), hierarchy, plain)
 
     # One after the other by the same code: it is compiled once.
     (entered, left), walks = jax.lax.map(count, jnp.array([1, -1], jnp.int32))
+    return StencilWalk(entered, left, _together(walks))
+
+
+def shadow_merge(
+    polygons: StencilPolygons, hierarchy: Hierarchy, walk: StencilWalk, plan: ShadowPlan, by_failing: bool
+) -> ShadowMask:
+    """Samples whose stencil is not zero."""
+    entered, left = walk.entered, walk.left
     added, taken = (left, entered) if by_failing else (entered, left)
-    before = around_eye if plan.around_eye and not by_failing else jnp.int32(0)
+    before = polygons.around_eye if plan.around_eye and not by_failing else jnp.int32(0)
     if plan.stencil == "saturate":  # all that add are drawn first
         is_set = jnp.maximum(jnp.minimum(before + added, _LARGEST) - taken, 0) > 0
     elif plan.stencil == "wrap":
         is_set = (before + added - taken) % (_LARGEST + 1) != 0
     else:
         is_set = before + added != taken
-    n_in_tile = jnp.where(jnp.asarray(tile >= 0), jnp.sum(samples.receives, axis=1, dtype=jnp.int32)[tiles], 0)
-    item_of_sample = jnp.broadcast_to(jnp.asarray(place_of)[:, None], samples.receives.shape)
-    result = mask_of(
-        _together(walks), inward != 0, samples, item_of_sample, n_in_tile, n_in_tile, jnp.sum(n_in_tile > 0,
-        dtype=jnp.int32),
-        jnp.int32(0), False,
-    )  # fmt: skip
-    places = jnp.asarray(place_of)
-    updates = jnp.sum(jnp.where(samples.receives, (added + taken)[places], 0), dtype=jnp.int64)
-    shadowed = in_runs(samples.receives & is_set[places], samples.viewport, samples.tile_px)
-    counts = eqx.tree_at(lambda counts: counts.stencil_updates, result.counts, updates)
-    return ShadowMask(shadowed, result.overflowed, result.tests, counts)
+    receives, item = hierarchy.samples.receives, hierarchy.item_of_sample[:, 0]
+    updates = jnp.sum(jnp.where(receives, (added + taken)[item], 0), dtype=jnp.int64)
+    mask = mask_of(receives & is_set[item], walk.walk, polygons.casts, hierarchy)
+    return eqx.tree_at(lambda mask: mask.counts.stencil_updates, mask, updates)
 
 
 _LARGEST = 255
@@ -222,12 +254,11 @@ def _seen_volumes(polygons: Polygons, drawn: Bool[Array, " polygons"], before: b
         (last(offset, jnp.inf).astype(jnp.float32),),
     )  # fmt: skip
     zero = jnp.zeros(3, jnp.float64)
-    return Volumes(plane_table(edges), plane_table(nodes), keeps, tuple(zero), jnp.float64(0))
+    return Volumes(plane_table(edges), plane_table(nodes), keeps, jnp.zeros(keeps.shape), tuple(zero), jnp.float64(0))
 
 
 def _together(walks: Walk) -> Walk:
     """Two walks of the same tree, stacked, as one."""
     total = jax.tree.map(lambda c: jnp.sum(c, axis=0, dtype=c.dtype), walks)
-    return eqx.tree_at(
-        lambda walk: (walk.groups, walk.overflowed), total, (jnp.max(walks.groups, axis=0), jnp.any(walks.overflowed))
-    )
+    held = jnp.max(walks.counts.groups, axis=0), jnp.any(walks.overflowed)
+    return eqx.tree_at(lambda walk: (walk.counts.groups, walk.overflowed), total, held)

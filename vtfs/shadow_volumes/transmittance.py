@@ -21,11 +21,12 @@ from vtfs.alpha_casters import LARGEST_ALPHA, AlphaSurfaces, Blending
 from vtfs.bit_lists import last_not_above
 from vtfs.random_words import random_words
 from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
-from vtfs.shadow_volumes.cluster_hierarchy import cluster_tree
+from vtfs.shadow_volumes import cluster_hierarchy, ptsv
+from vtfs.shadow_volumes.leaf_tests import sample_rows
+from vtfs.shadow_volumes.merge import mask_of
 from vtfs.shadow_volumes.planes import EdgePlanes, Vector, dot, inside
-from vtfs.shadow_volumes.ptsv import depth_tree
 from vtfs.shadow_volumes.sample_tiles import SampleTiles, in_runs
-from vtfs.shadow_volumes.walk import leaf_lists, mask_of_tree, rows_of_samples, volumes
+from vtfs.shadow_volumes.walk import to_items
 
 LOG_STEP = 2.0**-32
 """Logarithms are summed in steps of this: such sums are exact in float64 below 2^20, in whatever order."""
@@ -62,31 +63,29 @@ def transmit(
     - `frame`: with the triangles that `surfaces` describes.
     - `stream`: seed, and number of the view: other numbers give other random bits.
     """
-    if technique == "ptsv":
-        volume = volumes(frame, plan, about_light=False)
-        tree = depth_tree(frame, plan)
-    else:
-        volume = volumes(frame, plan, about_light=not frame.directional)
-        tree = cluster_tree(frame, plan, volume)
-    lists, walked = leaf_lists(volume, tree, plan)
-    samples = tree.samples
+    stages = ptsv if technique == "ptsv" else cluster_hierarchy
+    volume, hierarchy = stages.shadow_planes(frame, plan), stages.shadow_build(frame, plan)
+    # No node lies farther behind a triangle than infinity: none is accepted.
+    unaccepting = eqx.tree_at(lambda v: v.bias_m, volume, jnp.full_like(volume.bias_m, jnp.inf))
+    at, walk = to_items(unaccepting, hierarchy, plan)
+    samples, lists = hierarchy.samples, at.lists
     n_tiles, n_samples = samples.z_m.shape
-    n_items = tree.tile_of_item.shape[0]
+    n_items = hierarchy.tile_of_item.shape[0]
     capacity, lanes = lists.triangle.shape
     chunk = max(1, min(capacity, _PAIRS_AT_ONCE.get(jax.default_backend(), 2**22) // (lanes * n_samples)))
     n_padded = -(-capacity // chunk) * chunk
     triangle = jnp.pad(lists.triangle, ((0, n_padded - capacity), (0, 0)))
     n_groups = jnp.minimum(lists.n_groups, capacity)
     item_of_group = jnp.minimum(last_not_above(lists.start, jnp.arange(n_padded, dtype=jnp.int32)), n_items - 1)
-    rows, pixel = rows_of_samples(samples, volume), _pixels(samples)
+    rows, pixel = sample_rows(hierarchy, volume), _pixels(samples)
 
     def loop(state):
         first, total = state
         group = first + jnp.arange(chunk, dtype=jnp.int32)
         item = jax.lax.dynamic_slice_in_dim(item_of_group, first, chunk)
-        tile = tree.tile_of_item[item]
+        tile = hierarchy.tile_of_item[item]
         # A tile is tested as a whole; of what is found, each cluster keeps its own samples.
-        own = (tree.item_of_sample[tile] == item[:, None]) & samples.receives[tile]
+        own = (hierarchy.item_of_sample[tile] == item[:, None]) & samples.receives[tile]
         chosen = jax.lax.dynamic_slice_in_dim(triangle, first, chunk)
         row = rows[tile]
         position = tuple(row[:, c, None].astype(jnp.float64) - volume.origin_m[c] for c in range(3))
@@ -100,11 +99,9 @@ def transmit(
     state = (jnp.int32(0), jnp.zeros((n_tiles, 1 + n_channels, n_samples), jnp.float64))
     _, total = jax.lax.while_loop(lambda state: state[0] < n_groups, loop, state)
     view = samples.viewport, samples.tile_px
-    mask = mask_of_tree(walked, volume.safe, tree)
-    stopped = in_runs(total[:, 0] > 0, *view)
-    mask = eqx.tree_at(lambda m: m.shadowed, mask, stopped)
+    mask = mask_of(total[:, 0] > 0, walk, volume.safe, hierarchy)
     logs = [in_runs(total[:, 1 + c], *view) for c in range(n_channels)]
-    return Transmitted(tuple(jnp.where(stopped, 0, jnp.exp(log)).astype(jnp.float32) for log in logs), mask)
+    return Transmitted(tuple(jnp.where(mask.shadowed, 0, jnp.exp(log)).astype(jnp.float32) for log in logs), mask)
 
 
 def _stopped(

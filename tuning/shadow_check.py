@@ -1,0 +1,152 @@
+"""Is a shadow technique right? Its masks against Embree and float64, before it is timed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vtfs.cache import cached
+from vtfs.gbuffer import from_runs
+from vtfs.layers import Layers, TransparentLayer
+from vtfs.lights import Lights
+from vtfs.parameters import Configuration
+from vtfs.reference import ViewShadows, forward_reference
+from vtfs.shadow_casters import FrontFaces
+from vtfs.shadow_inputs import FrameShadows
+from vtfs.shadow_references import brute_force, classify, kept_casters, view_points_m
+from vtfs.view_samples import ViewSamples
+
+MOST_IN_BANDS = 1e-3
+"""Share of the tested samples that may differ near edges and planes of casters, where rounding decides."""
+
+_GRAZING = 1e-6
+"""Cosine below which rounding decides whether a surface faces the light; it is black there, in shadow or not."""
+
+_MOST_CLASSIFIED = 200
+"""Each costs a look at all casters; of more mismatches so many, evenly spread, are looked at."""
+
+
+@dataclass(frozen=True)
+class MaskCheck:
+    """What is wrong with the masks of a configuration; empty where they are right.
+
+    - `image`: the reference image, with the masks' own answer where either is right.
+    """
+
+    wrong: str
+    image: np.ndarray
+
+
+class ShadowChecker:
+    """The reference masks and image of one frame, made once and kept in the cache."""
+
+    def __init__(self, shadows: FrameShadows, samples: ViewSamples, lights: Lights, key: tuple[str, ...]):
+        self._shadows, self._samples, self._lights, self._key = shadows, samples, lights, key
+        self._masks: dict[FrontFaces, np.ndarray] = {}
+        self._image: np.ndarray | None = None
+
+    def masks(self, front_faces: FrontFaces) -> np.ndarray:
+        """By Embree: bool `[views, slots, h, w]`."""
+        if front_faces not in self._masks:
+            shadows = self._shadows
+
+            def trace() -> dict[str, np.ndarray]:
+                masks = [
+                    [shadows.reference(view, k, "shadow_rays", front_faces) for k in range(len(shadows.lights))]
+                    for view in shadows.views
+                ]
+                return {"bits": np.packbits(np.array(masks), axis=-1)}
+
+            width = self._samples.valid.shape[1]
+            bits = cached("shadow_references", (*self._key, front_faces), trace)["bits"]
+            self._masks[front_faces] = np.unpackbits(bits, axis=-1, count=width).astype(bool)
+        return self._masks[front_faces]
+
+    def image(self) -> np.ndarray:
+        """The float64 image under the shadows that Embree finds, with all casters."""
+        if self._image is None:
+
+            def shade() -> dict[str, np.ndarray]:
+                return {"image": forward_reference(self._samples, self._lights, self._of_views(self.masks("cast")))}
+
+            self._image = cached("references", (*self._key, "shadowed"), shade)["image"]
+        return self._image
+
+    def check(self, config: Configuration, masks: Sequence[np.ndarray]) -> MaskCheck:
+        """Compare the masks `[h, w]` of all slots on each view with those of the same casters.
+
+        Where they differ from Embree's, which is float32, brute force in float64 decides.
+        """
+        shadows = self._shadows
+        n_slots = len(shadows.lights)
+        front_faces: FrontFaces = config["front_faces"]  # type: ignore[assignment]
+        found = np.array(masks).reshape(len(shadows.views), n_slots, *self._samples.valid.shape)
+        reference = self.masks(front_faces)
+        n_tested = n_errors = n_edge = n_plane = 0
+        differs = np.zeros_like(found)
+        for v, view in enumerate(shadows.views):
+            for k in range(n_slots):
+                tested = shadows.lit_by(view, k) & self._not_grazing(view, k)
+                differs[v, k] = tested & (found[v, k] != reference[v, k])
+                n_tested += int(tested.sum())
+                edge, plane, errors = self._by_reason(view, k, found[v, k], differs[v, k], front_faces)
+                n_edge, n_plane, n_errors = n_edge + edge, n_plane + plane, n_errors + errors
+        wrong = ""
+        if n_errors or n_edge + n_plane > MOST_IN_BANDS * max(n_tested, 1000):
+            wrong = (
+                f"shadows: {n_errors:,} of {n_tested:,} samples are wrong against float64 brute force, besides "
+                f"{n_edge:,} near an edge and {n_plane:,} near the plane of a caster"
+            )
+        if wrong or front_faces == "culled" or not differs.any():
+            return MaskCheck(wrong, self.image())
+        return MaskCheck("", self._with_masks(np.where(differs, found, reference), differs.any(axis=1)))
+
+    def _by_reason(
+        self, view: ViewSamples, k: int, mask: np.ndarray, differs: np.ndarray, front_faces: FrontFaces
+    ) -> tuple[int, int, int]:
+        """Of the samples that differ from Embree: near an edge, near a plane, wrong."""
+        n = int(differs.sum())
+        if not n:
+            return 0, 0, 0
+        light, bias_m = self._shadows.lights[k], self._shadows.bias_m
+        casters = kept_casters(self._shadows.scene.casters, light, front_faces)
+        points, eye_m = view_points_m(view, differs), np.array(view.camera.eye_m)
+        spread = np.linspace(0, n - 1, min(n, _MOST_CLASSIFIED)).round().astype(int)
+        points, own = points[spread], mask[differs][spread]
+        truth = brute_force(points, casters, light, bias_m, eye_m)
+        reasons = classify(points, own != truth, casters, light, bias_m, eye_m)
+        scale = n / len(points)
+        counts = (reasons.near_edge, reasons.near_plane, reasons.errors)
+        return tuple(round(scale * count) for count in counts)  # type: ignore[return-value]
+
+    def _not_grazing(self, view: ViewSamples, k: int) -> np.ndarray:
+        light, camera = self._shadows.lights[k], view.camera
+        at = light.homogeneous
+        to = camera.view_from_world[:3, :3] @ at[:3] + at[3] * camera.view_from_world[:3, 3]
+        to = to - at[3] * view.position_m.astype(np.float64)
+        length = np.linalg.norm(to, axis=-1)
+        range_m = self._shadows.range_m[k]
+        near = True if light.directional else length < range_m * (1 - 1e-6)
+        return near & ((to * view.normal).sum(axis=-1) > _GRAZING * length)
+
+    def _of_views(self, masks: np.ndarray) -> list[ViewShadows]:
+        return [ViewShadows(self._shadows.slot, own, self._shadows.scene.suns) for own in masks]
+
+    def _with_masks(self, masks: np.ndarray, changed: np.ndarray) -> np.ndarray:
+        """The reference image, shaded again with other masks in the pixels where a view's have changed."""
+        pixels = changed.any(axis=0)
+        layers = tuple(
+            TransparentLayer(replace(layer.samples, valid=layer.samples.valid & pixels), layer.opacity * pixels)
+            for layer in self._samples.layers.transparent
+        )
+        some = replace(self._samples, valid=self._samples.valid & pixels, layers=Layers(lambda: layers))
+        image = self.image().copy()
+        image[pixels] = forward_reference(some, self._lights, self._of_views(masks))[pixels]
+        return image
+
+
+def masks_on_host(masks: Sequence, samples: ViewSamples) -> list[np.ndarray]:
+    """`CastMask`s as images `[h, w]`."""
+    return [from_runs(np.asarray(mask), samples.camera.viewport) for mask, _ in masks]

@@ -1,0 +1,233 @@
+"""What the shadow techniques start from on one frame: casters, the lights that cast, and a task for each light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vtfs.directional_lights import DirectionalLights
+from vtfs.gbuffer import Fragments, to_runs
+from vtfs.input_error import InputError
+from vtfs.layers import Layers
+from vtfs.light_shadows import MAX_SHADOW_LIGHTS, CastMask, ShadowSlots
+from vtfs.lights import Lights
+from vtfs.parameters import Configuration
+from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, opaque_casters
+from vtfs.shadow_mask import (
+    CastersOnDevice,
+    ShadowFrame,
+    casters_on_device,
+    default_bias_m,
+    facing_samples,
+    shadow_frame,
+)
+from vtfs.shadow_references import ShadowRays, brute_force, kept_casters, view_points_m
+from vtfs.shadow_techniques import grid_of
+from vtfs.shadow_volumes.volumes import rotated
+
+if TYPE_CHECKING:
+    from vtfs.scene import Scene
+    from vtfs.view_samples import ViewSamples
+
+_RANKED_SAMPLES = 4096
+"""Of a frame, by which its lights are ranked."""
+
+
+@dataclass(frozen=True)
+class ShadowScene:
+    """What casts shadows in a scene.
+
+    - `n_lights`: lights with a place that cast on each frame: those that light it most. Directional ones all do.
+    """
+
+    casters: Casters
+    suns: DirectionalLights
+    n_lights: int
+
+    def __post_init__(self):
+        if not 0 <= self.n_lights <= MAX_SHADOW_LIGHTS - self.suns.n_lights:
+            raise InputError(
+                f"--shadow-lights {self.n_lights}: with {self.suns.n_lights} directional lights must be from 0 to "
+                f"{MAX_SHADOW_LIGHTS - self.suns.n_lights}."
+            )
+
+    @cached_property
+    def on_device(self) -> CastersOnDevice:
+        return casters_on_device(self.casters)
+
+    @cached_property
+    def rays(self) -> ShadowRays:
+        return ShadowRays(self.casters)
+
+
+def shadow_scene(scene: Scene, suns: DirectionalLights, n_lights: int) -> ShadowScene:
+    """Of a scene with materials: its opaque triangles cast."""
+    return ShadowScene(opaque_casters(scene), suns, n_lights)
+
+
+class ShadowTask(eqx.Module):
+    """The shadow of one light on one view: the solid samples, or a transparent layer.
+
+    - `frame`: which samples receive shadow is not known yet: all that are valid do.
+    - `range_m`: beyond it the light lights nothing; infinite for a directional one.
+    """
+
+    frame: ShadowFrame
+    normal: tuple[Float[Array, "runs 32"], ...]
+    range_m: Float[Array, ""]
+
+
+def with_receivers(task: ShadowTask) -> ShadowFrame:
+    """Only samples that the light would light are tested: in its range, and not turned away from it. Inside of
+    `jax.enable_x64(True)`."""
+    frame = task.frame
+    from_eye = frame.light_m if frame.directional else frame.light_m - frame.eye_m
+    light = tuple(c.astype(jnp.float32) for c in rotated(frame, tuple(from_eye)))
+    at = frame.positions.x_m, frame.positions.y_m, frame.positions.z_m
+    to = light if frame.directional else tuple(c - p for c, p in zip(light, at, strict=True))
+    faces = sum(n * t for n, t in zip(task.normal, to, strict=True)) > 0
+    if not frame.directional:
+        faces &= sum(t * t for t in to) < task.range_m * task.range_m
+    return eqx.tree_at(lambda f: f.receives, frame, frame.receives & faces)
+
+
+def brightest_lights(samples: ViewSamples, lights: Lights, n: int) -> np.ndarray:
+    """The `n` lights that light the visible samples most, brightest first; fewer where fewer light any.
+
+    Irradiance, mean over the colours, summed over at most 4,096 evenly spaced samples.
+    """
+    at = np.flatnonzero(samples.valid.ravel())
+    at = at[:: max(1, -(-len(at) // _RANKED_SAMPLES))]
+    position, normal = (c.reshape(-1, 3)[at].astype(np.float64) for c in (samples.position_m, samples.normal))
+    view = lights.relative_to(samples.camera.view_from_world)
+    light_of_all = np.zeros(lights.n_lights)
+    for light in np.flatnonzero(view.range_m > 0):
+        to = view.position_m[light] - position
+        squared = np.maximum((to * to).sum(axis=1), 1e-300)
+        near = squared < view.range_m[light] ** 2
+        to, squared, facing = to[near], squared[near], normal[near]
+        along = -(to @ view.direction[light]) / np.sqrt(squared)
+        cone = (along - view.cos_outer[light]) / (view.cos_inner[light] - view.cos_outer[light])
+        window = (1 - (squared / view.range_m[light] ** 2) ** 2) ** 2
+        arriving = np.maximum((to * facing).sum(axis=1), 0) / np.sqrt(squared) * window / np.maximum(squared, 1e-4)
+        light_of_all[light] = (arriving * cone.clip(0, 1)).sum() * view.colour[light].mean()
+    ranked = np.argsort(-light_of_all, kind="stable")[:n]
+    return ranked[light_of_all[ranked] > 0]
+
+
+class FrameShadows:
+    """Lights that cast on one frame, its views, and their tasks on the device.
+
+    - `views`: the solid samples, then each transparent layer.
+    - `lights`, `range_m`: in the order of their slots, directional ones first.
+    - `slot`: of each light with a place its slot; -1 where it casts nothing.
+    """
+
+    def __init__(self, scene: ShadowScene, samples: ViewSamples, lights: Lights):
+        self.scene = scene
+        # Each layer is a view of its own.
+        self.views = (replace(samples, layers=Layers()), *(layer.samples for layer in samples.layers.transparent))
+        suns = scene.suns
+        chosen = brightest_lights(samples, lights, scene.n_lights)
+        self.slot = np.full(max(lights.n_lights, 1), -1, np.int32)  # no light at all is one without range
+        self.slot[chosen] = suns.n_lights + np.arange(len(chosen))
+        self.lights = (
+            *(ShadowLight(tuple(toward), directional=True) for toward in suns.toward.tolist()),
+            *(ShadowLight(tuple(place)) for place in lights.position_m[chosen].tolist()),
+        )
+        self.range_m = np.concatenate([np.full(suns.n_lights, np.inf), lights.range_m[chosen]])
+        if not self.lights:
+            raise InputError("no light casts a shadow on this frame; give --shadow-lights 1 or more, or other lights.")
+
+    @cached_property
+    def slots(self) -> ShadowSlots:
+        """Upload which light has which bit."""
+        rotation = self.views[0].camera.view_from_world[:3, :3]
+        suns = self.scene.suns
+        row = np.concatenate([suns.toward @ rotation.T, suns.colour], axis=1).astype(np.float32)
+        return ShadowSlots(jax.device_put(self.slot), jax.device_put(row), len(self.lights))
+
+    @cached_property
+    def bias_m(self) -> float:
+        return default_bias_m(self.scene.casters)
+
+    @cached_property
+    def _deepest_m(self) -> float:
+        depths = [-view.position_m[..., 2][view.valid].min(initial=-view.camera.near_m) for view in self.views]
+        return float(max(depths))
+
+    @cached_property
+    def _on_device(self) -> tuple:
+        fragments = [Fragments(view, with_hidden=False) for view in self.views]
+        positions = [own.positions() for own in fragments]
+        return tuple((own, part.gbuffer(own, "float32").normal) for part, own in zip(fragments, positions, strict=True))
+
+    def tasks(self, config: Configuration) -> list[ShadowTask]:
+        """For each view the tasks of all slots."""
+        params = config.params
+        camera = self.views[0].camera
+        grid = grid_of(camera, self._deepest_m, int(params["tile_px"]), int(params.get("depth_slices", 0)))
+        front_faces: FrontFaces = params["front_faces"]  # type: ignore[assignment]
+        tasks = []
+        for view, (positions, normal) in zip(self.views, self._on_device, strict=True):
+            for light, range_m in zip(self.lights, self.range_m, strict=True):
+                frame = shadow_frame(view, self.scene.on_device, light, grid, self.bias_m, None, front_faces, positions)
+                tasks.append(ShadowTask(frame, normal, jax.device_put(np.float32(range_m))))
+        return tasks
+
+    def reference_masks(self, config: Configuration) -> list[CastMask]:
+        """Masks of a reference technique, in the order of `tasks`, in runs."""
+        front_faces: FrontFaces = config["front_faces"]  # type: ignore[assignment]
+        masks = []
+        for view in self.views:
+            for k in range(len(self.lights)):
+                mask = self.reference(view, k, config.technique, front_faces)
+                masks.append((jax.device_put(to_runs(mask)), np.bool_(False)))
+        return masks
+
+    def lit_by(self, view: ViewSamples, k: int) -> np.ndarray:
+        """Samples of a view that the light of a slot would light: bool `[h, w]`, in float64."""
+        light, range_m = self.lights[k], self.range_m[k]
+        lit = facing_samples(view, light)
+        if not light.directional:
+            matrix = view.camera.view_from_world
+            place = matrix[:3, :3] @ np.array(light.position_m) + matrix[:3, 3]
+            lit &= ((place - view.position_m.astype(np.float64)) ** 2).sum(axis=-1) < range_m**2
+        return lit
+
+    def reference(self, view: ViewSamples, k: int, name: str, front_faces: FrontFaces) -> np.ndarray:
+        """Samples of a view in the shadow of the light of a slot, bool `[h, w]`, by `shadow_rays` or `brute_force`."""
+        lit = self.lit_by(view, k)
+        points, eye_m = view_points_m(view, lit), np.array(view.camera.eye_m)
+        light = self.lights[k]
+        casters = kept_casters(self.scene.casters, light, front_faces)
+        if name == "brute_force":
+            shadowed = brute_force(points, casters, light, self.bias_m, eye_m)
+        else:
+            shadowed = self._rays(light, front_faces).shadowed(points, light, self.bias_m, eye_m)
+        mask = np.zeros(lit.shape, bool)
+        mask[lit] = shadowed
+        return mask
+
+    def _rays(self, light: ShadowLight, front_faces: FrontFaces) -> ShadowRays:
+        if front_faces == "cast":
+            return self.scene.rays
+        return ShadowRays(kept_casters(self.scene.casters, light, front_faces))
+
+
+@jax.jit
+def _receiving(task: ShadowTask) -> ShadowFrame:
+    return with_receivers(task)
+
+
+def receiving(task: ShadowTask) -> ShadowFrame:
+    """`with_receivers`, as a program of its own."""
+    with jax.enable_x64(True):
+        return _receiving(task)

@@ -1,0 +1,224 @@
+"""Volumes down the levels of a tree: from the lists of one level's nodes to those of a level below."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, UInt32
+
+from vtfs.bit_lists import last_not_above
+from vtfs.node_lists import NodeLists, Split, split, split_at_once
+from vtfs.shadow_mask import ShadowPlan
+from vtfs.shadow_volumes.hierarchy import Hierarchy
+from vtfs.shadow_volumes.planes import test_nodes
+from vtfs.shadow_volumes.volumes import Volumes
+
+LANES = 16
+"""Triangles of a group on inner levels: both answers of their tests of a child pack into one word."""
+
+LEAF_LANES = 4
+"""Triangles of a group at the leaves: short lists waste little, and a tile's samples are loaded once for four."""
+
+_TRIANGLES_AT_ONCE = {"cpu": 2**15}
+"""Triangles listed in one chunk of a loop: what stays in the caches of a CPU. Elsewhere a step of a loop costs more."""
+
+_CHILDREN_AT_ONCE = 8
+"""Children that one thread of a GPU tests: a triangle's planes are loaded once for them."""
+
+
+class LevelCounts(eqx.Module):
+    """Counts as in `ShadowCounts`, of the levels walked; others are zero.
+
+    - `dropped`: (triangle, child) pairs that would have gone on, into a child that lies in shadow as a whole.
+    - `of_triangle`: tests of nodes, by triangle; the last entry is of none.
+    """
+
+    node_tests: Int[Array, " levels"]
+    accepted: Int[Array, " levels"]
+    refined: Int[Array, " levels"]
+    extra: Int[Array, " levels"]
+    dropped: Int[Array, " levels"]
+    groups: Int[Array, " levels_and_1"]
+    of_triangle: Int[Array, " triangles_and_1"]
+
+    def plus(self, more: LevelCounts) -> LevelCounts:
+        """Both walks; lists are held one after the other."""
+        total = jax.tree.map(jnp.add, self, more)
+        return eqx.tree_at(lambda counts: counts.groups, total, jnp.maximum(self.groups, more.groups))
+
+
+def no_counts(n_levels: int, n_triangles: int) -> LevelCounts:
+    zeros = jnp.zeros(n_levels, jnp.int64)
+    groups, of_triangle = jnp.zeros(n_levels + 1, jnp.int32), jnp.zeros(n_triangles + 1, jnp.int32)
+    return LevelCounts(zeros, zeros, zeros, zeros, zeros, groups, of_triangle)
+
+
+class AtLevel(eqx.Module):
+    """Where a walk stands: what is to be tested at the nodes of one level.
+
+    - `in_shadow`: nodes of the level that lie in shadow as a whole; `cover`: triangles that accept each of them, or a
+      node above.
+    - `shadowed`: of all nodes below the root, with room for one more level.
+    """
+
+    lists: NodeLists
+    in_shadow: Bool[Array, " nodes"]
+    cover: Int[Array, " nodes"]
+    shadowed: Bool[Array, " places"]
+    counts: LevelCounts
+
+
+def n_shadowed_places(hierarchy: Hierarchy) -> int:
+    """Length of `AtLevel.shadowed`: a level is read and written as if it were full."""
+    table = hierarchy.table
+    return table.n_places + table.level_nodes[-1] * table.branching
+
+
+def descend(at: AtLevel, first: int, last: int, volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> AtLevel:
+    """From the lists of level `first` (0: the root) to those of level `last` (the number of levels: the items).
+
+    Where `plan.level_groups` says what each level holds, levels are unrolled and nothing loops. Otherwise one loop runs
+    over inner levels, all of them as wide as the widest, as one program is compiled faster than seven.
+    """
+    table = hierarchy.table
+    levels, b = table.level_nodes, plan.branching
+    at_once = bool(plan.level_groups)
+    chunk = _TRIANGLES_AT_ONCE.get(jax.default_backend(), 2**22) // LANES
+    n_inner = len(levels) - 1
+
+    def visit(at: AtLevel, level, n_parents: int, n_kept: int, lanes: int, capacity: int) -> AtLevel:
+        lists = NodeLists(at.lists.triangle, at.lists.start[: n_parents + 1], at.lists.count[:n_parents])
+        n_children = n_parents * b
+        offset = jnp.asarray(table.first_child)[level]
+        was = jax.lax.dynamic_slice_in_dim(at.shadowed, offset, n_children)
+        parent = jnp.repeat(at.in_shadow[:n_parents], b, total_repeat_length=n_children)
+
+        def drop(accepted):
+            return accepted | parent | was if plan.feedback else jnp.zeros_like(accepted)
+
+        # A root with one child is no node of the tree: only the capacity's rounding made it.
+        only = table.n_below[level] == 1
+        row = jnp.asarray(table.first_row)[level]
+        done = _split_level(lists, drop, row, only, lanes, capacity, volume, hierarchy, plan, chunk)
+        now = parent | (done.accepts > 0) | was
+        own = jnp.arange(n_children, dtype=jnp.int32) < jnp.asarray((*levels[1:], levels[-1] * b), jnp.int32)[level]
+        shadowed = jax.lax.dynamic_update_slice_in_dim(at.shadowed, jnp.where(own, now, was), offset, 0)
+        cover = jnp.repeat(at.cover[:n_parents], b, total_repeat_length=n_children) + done.accepts
+        counts = _with_level(at.counts, lists, done, level, hierarchy, plan)
+        kept = NodeLists(done.lists.triangle, done.lists.start[: n_kept + 1], done.lists.count[:n_kept])
+        return AtLevel(kept, (now & own)[:n_kept], cover[:n_kept], shadowed, counts)
+
+    if at_once:
+        for level in range(first, min(last, n_inner)):
+            at = visit(at, level, levels[level], levels[level + 1], LANES, plan.level_groups[level])
+    elif first < min(last, n_inner):
+        at = _widened(at, levels[-1], plan.groups, volume.safe.shape[0])
+        groups = at.lists.triangle.shape[0]
+
+        def inner(level, at: AtLevel) -> AtLevel:
+            return visit(at, level, levels[-2], levels[-1], LANES, groups)
+
+        at = jax.lax.fori_loop(first, min(last, n_inner), inner, at)
+    if last == len(levels):
+        at = visit(at, n_inner, levels[-1], levels[-1] * b, LEAF_LANES, plan.leaf_groups)
+    return at
+
+
+def _widened(at: AtLevel, n_nodes: int, capacity: int, absent: int) -> AtLevel:
+    """The same lists with room for more nodes and groups."""
+    start, count, triangle = at.lists.start, at.lists.count, at.lists.triangle
+    more = n_nodes - count.shape[0]
+    pad = jnp.full((max(0, capacity - triangle.shape[0]), triangle.shape[1]), absent, jnp.int32)
+    lists = NodeLists(
+        jnp.concatenate([triangle, pad]),
+        jnp.concatenate([start, jnp.broadcast_to(start[-1], (more,))]),
+        jnp.pad(count, (0, more)),
+    )
+    return AtLevel(lists, jnp.pad(at.in_shadow, (0, more)), jnp.pad(at.cover, (0, more)), at.shadowed, at.counts)
+
+
+def _split_level(
+    lists: NodeLists, drop, first_row, only, lanes: int, capacity: int, volume: Volumes, hierarchy: Hierarchy,
+    plan: ShadowPlan, chunk: int,
+) -> Split:  # fmt: skip
+    """Test the triangles listed at the nodes of a level against their children.
+
+    **Arguments:**
+
+    - `first_row`: of the level's nodes in the table; `only`: the level has one child, into which everything goes.
+    - `lanes`, `capacity`: of the children's groups.
+    """
+    table, absent, b = hierarchy.table, volume.safe.shape[0], plan.branching
+    bias_m = volume.bias_m.astype(jnp.float32)
+
+    def rows_of(node):
+        return table.row.at[first_row + node].get(mode="promise_in_bounds")
+
+    def by_lanes(triangle, node):
+        """All children and triangles of a group side by side: vectors of a CPU."""
+        row = rows_of(node)
+        planes = jax.tree.map(lambda c: c[:, None, :], volume.nodes.at(triangle))
+        boxes = tuple(row[:, c, :, None] for c in range(6))
+        refined, goes_on, accepted = test_nodes(planes, boxes, hierarchy.is_frustum, bias_m)
+        pass_on = jnp.zeros((1, b, 1), bool).at[:, 0].set(True) & (triangle != absent)[:, None, :]
+        goes_on, accepted = jnp.where(only, pass_on, goes_on), accepted & ~only
+        # Both answers in one word: two reductions would each repeat the tests.
+        shift = jnp.arange(LANES, dtype=jnp.uint32)
+        both = (goes_on.astype(jnp.uint32) << shift) | (accepted.astype(jnp.uint32) << (shift + LANES))
+        both = jnp.sum(both, axis=-1, dtype=jnp.uint32)
+        extra = jnp.where(only, 0, jnp.sum(refined, dtype=jnp.int32))
+        return both & jnp.uint32(2**LANES - 1), both >> LANES, extra
+
+    def by_triangles(triangle, node):
+        """Some children of one triangle after the other: a thread of a GPU loads its planes once."""
+        width = min(b, _CHILDREN_AT_ONCE)
+        row = rows_of(node).reshape(node.shape[0], 6, b // width, width)
+        planes = jax.tree.map(lambda c: c[:, None, :], volume.nodes.at(triangle))
+        both = n_refined = jnp.uint32(0)
+        for child in range(width):
+            boxes = tuple(row[:, c, :, child, None] for c in range(6))
+            refined, goes_on, accepted = test_nodes(planes, boxes, hierarchy.is_frustum, bias_m)
+            both = both | (goes_on.astype(jnp.uint32) << child) | (accepted.astype(jnp.uint32) << (child + width))
+            n_refined = n_refined + refined.astype(jnp.uint32)
+        first = jnp.arange(b // width, dtype=jnp.int32)[:, None] == 0
+        both = jnp.where(only, (first & (triangle != absent)[:, None, :]).astype(jnp.uint32), both)
+        # Not fused into what reads it, which would test again for every child.
+        both = jax.lax.optimization_barrier(both)
+        extra = jnp.where(only, 0, jnp.sum(n_refined, dtype=jnp.int32))
+
+        def of_children(words: UInt32[Array, "groups blocks lanes"]) -> UInt32[Array, "groups branching"]:
+            child, lane = jnp.arange(width, dtype=jnp.uint32)[:, None], jnp.arange(LANES, dtype=jnp.uint32)
+            bits = (words[:, :, None, :] >> child & 1) << lane
+            return jnp.sum(bits, axis=-1, dtype=jnp.uint32).reshape(-1, b)
+
+        return of_children(both), of_children(both >> width), extra
+
+    if plan.level_groups:
+        return split_at_once(lists, by_triangles, drop, b, lanes, absent, capacity)
+    return split(lists, by_lanes, drop, b, lanes, absent, capacity, chunk)
+
+
+def _with_level(
+    counts: LevelCounts, lists: NodeLists, done: Split, level, hierarchy: Hierarchy, plan: ShadowPlan
+) -> LevelCounts:
+    """The counts with those of one level."""
+    table = hierarchy.table
+    n_rows = lists.count.shape[0]
+    only = table.n_below[level] == 1
+    children = jax.lax.dynamic_slice_in_dim(table.n_children, jnp.asarray(table.first_row)[level], n_rows)
+    tests = jnp.where(only, 0, jnp.sum(lists.count.astype(jnp.int64) * children, dtype=jnp.int64))
+    extra = jnp.where(plan.extra != "off", done.extra, 0)
+    n_groups = lists.triangle.shape[0]
+    group = jnp.arange(n_groups, dtype=jnp.int32)
+    node = jnp.minimum(last_not_above(lists.start, group), n_rows - 1)
+    each = jnp.where((group < lists.n_groups) & ~only, children[node], 0)
+    return LevelCounts(
+        counts.node_tests.at[level].add(tests),
+        counts.accepted.at[level].add(done.n_accepted),
+        counts.refined.at[level].add(jnp.where(only, 0, done.n_refined)),
+        counts.extra.at[level].add(extra),
+        counts.dropped.at[level].add(done.n_dropped),
+        counts.groups.at[level].max(lists.n_groups).at[level + 1].max(done.lists.n_groups),
+        counts.of_triangle.at[lists.triangle].add(each[:, None]),
+    )

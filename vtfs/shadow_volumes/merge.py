@@ -1,0 +1,45 @@
+"""The last pass: each sample takes its bit from its tile or cluster."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from vtfs.shadow_mask import ShadowCounts, ShadowMask
+from vtfs.shadow_volumes.hierarchy import Hierarchy
+from vtfs.shadow_volumes.sample_tiles import in_runs
+from vtfs.shadow_volumes.volumes import Volumes
+from vtfs.shadow_volumes.walk import Walk, bits_of_samples
+
+
+def shadow_merge(volume: Volumes, hierarchy: Hierarchy, walk: Walk) -> ShadowMask:
+    """The mask of all samples, in runs, with all counts."""
+    return mask_of(bits_of_samples(walk.shadowed, hierarchy), walk, volume.safe, hierarchy)
+
+
+def mask_of(
+    shadowed: Bool[Array, "tiles lanes"], walk: Walk, casts: Bool[Array, " triangles"], hierarchy: Hierarchy
+) -> ShadowMask:
+    """Samples of tiles back in runs."""
+    samples, nodes = hierarchy.samples, walk.counts
+    counts = ShadowCounts(
+        node_tests=nodes.node_tests,
+        accepted=nodes.accepted,
+        refined=nodes.refined,
+        dropped=nodes.dropped,
+        extra_plane_tests=nodes.extra,
+        sample_tests=walk.sample_tests,
+        sample_tests_in_cluster=jnp.sum(walk.tests, dtype=jnp.int64),
+        dropped_samples=walk.dropped_samples,
+        stencil_updates=jnp.int64(-1),
+        tests_of_triangle=nodes.of_triangle[:-1],
+        groups=nodes.groups,
+        n_pairs=walk.n_pairs,
+        list_length=walk.list_length,
+        n_items=hierarchy.n_items,
+        n_blocks=hierarchy.n_blocks,
+        n_casters=jnp.sum(casts, dtype=jnp.int32),
+    )
+    view = samples.viewport, samples.tile_px
+    overflowed = walk.overflowed | hierarchy.overflowed
+    return ShadowMask(in_runs(shadowed, *view), overflowed, in_runs(walk.tests, *view), counts)
