@@ -47,7 +47,7 @@ def main() -> None:
         )
         setup = set_up(options)
         frame = setup.n_frames // 2
-        inputs = FrameInputs(setup.samples(frame), setup.lights, frame)
+        inputs = FrameInputs(setup.samples(frame), setup.lights, frame=frame)
         seen = inputs.seen()
         reference = forward_reference(inputs.samples, setup.lights)
         images = {technique: render(configuration(technique), inputs) for technique in TECHNIQUES}

@@ -63,8 +63,10 @@ def main() -> None:
                 inputs = FrameInputs(
                     setup.samples(frame),
                     lights_of(frame),
-                    0 if last_sorted is None else 1,
-                    lambda _: view_lights(lights_of(last_sorted or 0), setup.cameras.camera(last_sorted or 0)),
+                    frame=0 if last_sorted is None else 1,
+                    earlier_lights=lambda _: view_lights(
+                        lights_of(last_sorted or 0), setup.cameras.camera(last_sorted or 0)
+                    ),
                 )
                 params = {"branching": asked.branching, "resort_every": 64}
                 counts = count(configuration("volume_tiled_bvh", params), inputs)[0].technique

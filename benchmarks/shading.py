@@ -17,7 +17,6 @@ from vtfs.frame import (
     count,
     frame_program,
     image_on_host,
-    narrowed,
     planned,
     run_stages,
     stage_program,
@@ -60,7 +59,7 @@ def main() -> None:
             at = counts.at_batch(batch)
             stages = {}
             for stage in REGISTRY[technique].stages_of(planned(config, sizes), inputs.has_transparent):
-                own = stage_program(stage, narrowed(stage, planned(config, sizes)))
+                own = stage_program(stage, stage.narrowed(planned(config, sizes)))
                 stages[stage.name] = median_ms(
                     lambda own=own, stage=stage, env=env: own(*(env[n] for n in stage.needs))
                 )

@@ -101,7 +101,7 @@ class ShadowChecker:
             )
         if wrong or front_faces == "culled" or not differs.any():
             return MaskCheck(wrong, self.image())
-        return MaskCheck("", self._with_masks(np.where(differs, found, reference), differs.any(axis=1)))
+        return MaskCheck("", self._with_masks(np.where(differs, found, reference), np.any(differs, axis=(0, 1))))
 
     def _by_reason(
         self, view: ViewSamples, k: int, mask: np.ndarray, differs: np.ndarray, front_faces: FrontFaces
@@ -134,9 +134,8 @@ class ShadowChecker:
     def _of_views(self, masks: np.ndarray) -> list[ViewShadows]:
         return [ViewShadows(self._shadows.slot, own, self._shadows.scene.suns) for own in masks]
 
-    def _with_masks(self, masks: np.ndarray, changed: np.ndarray) -> np.ndarray:
-        """The reference image, shaded again with other masks in the pixels where a view's have changed."""
-        pixels = changed.any(axis=0)
+    def _with_masks(self, masks: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """The reference image, shaded again with other masks in the pixels where any has changed."""
         layers = tuple(
             TransparentLayer(replace(layer.samples, valid=layer.samples.valid & pixels), layer.opacity * pixels)
             for layer in self._samples.layers.transparent
@@ -149,4 +148,4 @@ class ShadowChecker:
 
 def masks_on_host(masks: Sequence, samples: ViewSamples) -> list[np.ndarray]:
     """`CastMask`s as images `[h, w]`."""
-    return [from_runs(np.asarray(mask), samples.camera.viewport) for mask, _ in masks]
+    return [from_runs(np.asarray(mask.shadowed), samples.camera.viewport) for mask in masks]

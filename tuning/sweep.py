@@ -33,6 +33,9 @@ HOPELESS = 12
 TOO_SLOW = 4
 """A technique whose default takes this many times as long as the fastest one's is measured at its default only."""
 
+PATIENCE = 6
+"""So many choices in a row that gained nothing end the search: no model is sure of that on a noisy machine."""
+
 _ACCURACY_SHARE = 0.2  # of the budget, kept for the chart of speed against error
 
 
@@ -176,6 +179,9 @@ def search(
     in_budget = in_budget and all(run.measure(c, share) for c in spread if c.technique in explored.techniques)
     stop_reason = f"the budget of {budget} was used"
     while in_budget:
+        if run.fruitless(explored, design) >= PATIENCE:
+            stop_reason = f"the last {PATIENCE} choices gained nothing"
+            break
         models = run.frame_models(explored)
         choice = choose_next(explored, run.measured, run.counts, models, objective)
         if choice.stop_reason is not None:
@@ -302,6 +308,14 @@ class _Run:
     def fastest(self, candidates: Iterable[Configuration]) -> Configuration | None:
         times = {c: time_ms(m, self.objective) for c in candidates if (m := self.timed(c)) is not None}
         return min(times, key=times.__getitem__, default=None)
+
+    def fruitless(self, space: Space, design: Collection[Configuration]) -> int:
+        """How many choices of the search were measured since the fastest configuration was. By the record's order, so
+        that a run that goes on stops where one run would have."""
+        fastest = self.fastest(c for c in self.measured if c in space and c.is_exact)
+        since = list(self.measured)
+        since = since[since.index(fastest) + 1 :] if fastest is not None else since
+        return sum(c in space and c.is_exact and c not in design for c in since)
 
     def best(self, space: Space, max_error: float | None) -> Configuration:
         """The fastest that may be recommended."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -32,7 +33,6 @@ from vtfs.frame import (
     frame_program,
     image_on_host,
     is_listed,
-    narrowed,
     planned,
     run_stages,
     stage_program,
@@ -54,6 +54,9 @@ the rounding of its position (1e-7 of its distance to the eye) counts against it
 
 LOST = 1.1
 """A configuration this many times as slow as the best so far has lost: its time needs no more repeats."""
+
+HOPELESS = 1.6
+"""Where one run took this many times as long as the best so far, no other is made: a busy machine explains less."""
 
 TIMEOUT_S = 30.0
 """A frame that takes longer is recorded as `timeout`, not repeated."""
@@ -210,26 +213,23 @@ class SceneWorkload:
         if slow and (seconds := timed_ms(self._frame_run(config, 0)) / 1e3) > TIMEOUT_S:
             return "timeout", f"one frame took {seconds:.0f} s, more than {TIMEOUT_S:.0f} s"
 
+        # With `mean` every frame counts; with `max` only the slowest one, and there is a time to beat.
+        only_slowest = self._objective == "max"
+        beat_ms = best_ms if best_ms is not None and only_slowest else math.inf
         frames: list[tuple[float, ...]] = []
         slowest_low = 0.0
         for i in range(len(self._inputs)):
-            if (
-                frames
-                and best_ms is not None
-                and self._objective == "max"
-                and median_interval(frames[0])[0] > LOST * best_ms
-            ):
+            if frames and median_interval(frames[0])[0] > LOST * beat_ms:
                 frames.append(())  # it lost on the first frame: the others cannot make it faster
                 continue
 
             def decided(interval_ms: tuple[float, float], slowest_low: float = slowest_low) -> bool:
-                lost = best_ms is not None and interval_ms[0] > LOST * best_ms
-                # With `mean` every frame counts; with `max` only the slowest one.
-                return self._objective == "max" and (lost or interval_ms[1] < slowest_low)
+                return only_slowest and (interval_ms[0] > LOST * beat_ms or interval_ms[1] < slowest_low)
 
-            frames.append(repeats_ms(self._frame_run(config, i), decided))
+            frames.append(repeats_ms(self._frame_run(config, i), decided, hopeless_ms=HOPELESS * beat_ms))
             slowest_low = max(slowest_low, min(frames[-1]))
-        if all(frames) and is_listed(config):
+        # Models of stages are fitted to exact settings.
+        if all(frames) and is_listed(config) and config.is_exact:
             env = env or run_stages(config, self._inputs[0], sizes)[0]
         taken.stages_ms = self._stages_ms(config, sizes, env) | {"frame": tuple(frames)}
         return "timed", ""
@@ -254,7 +254,7 @@ class SceneWorkload:
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:
-            program = stage_program(stage, narrowed(stage, planned(config, sizes)))
+            program = stage_program(stage, stage.narrowed(planned(config, sizes)))
             arguments = [env[name] for name in stage.needs]
 
             def run(program: Callable = program, arguments: list = arguments) -> None:

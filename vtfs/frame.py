@@ -39,6 +39,7 @@ from vtfs.op_counts import (
 )
 from vtfs.parameters import PARAMETERS, SHADOW_REFERENCES, Configuration, lists_configuration, shading_batch
 from vtfs.shadow_inputs import FrameShadows, ShadowScene, ShadowTask, receiving
+from vtfs.shadow_mask import ShadowMask, ShadowPlan
 from vtfs.shadow_techniques import (
     CastShadows,
     fitted_to_all,
@@ -55,6 +56,8 @@ _BRUTE_FORCE_WORD = 32
 _NO_STRUCTURES = (
     "positions", "gbuffer", "normals", "grid", "light_cutoff", "approximate", "frame", "resort_every",
 )  # fmt: skip
+
+_SCALARS = ("grid", "light_cutoff", "approximate", "frame", "resort_every")
 
 
 class CapacityError(InputError):
@@ -211,10 +214,12 @@ class FrameInputs:
             env["normals"] = env["gbuffer"].normal if needs_normals else None
         elif technique.lists == "light_volumes":  # for its pixels
             env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
+        # A dozen scalars, each of which would be sent to a GPU by itself in every frame: 0.3 ms.
+        env |= jax.device_put({name: env[name] for name in _SCALARS if name in env})
         if technique.casts_shadows:
             env["shadow_slots"] = self.shadows.slots
             if config.technique in SHADOW_REFERENCES:
-                env["shadow_traverse"] = self.shadows.reference_masks(config)
+                env["shadow_merge"] = self.shadows.reference_masks(config)
             else:
                 env["shadow_tasks"] = self.shadows.tasks(config)
         return env
@@ -234,9 +239,9 @@ def planned(config: Configuration, sizes: Sizes) -> Plan:
 
 @functools.cache
 def stage_program(stage: Stage, plan: Plan) -> Callable[..., Any]:
-    """One stage as a program of its own. `plan` holds only what the stage names: see `narrowed`."""
+    """One stage as a program of its own. `plan` holds only what the stage names: see `Stage.narrowed`."""
     program = jax.jit(functools.partial(stage.run, plan))
-    return _for_each_shadow(program) if stage.per_shadow else program
+    return _for_each_shadow(program) if stage.casting else program
 
 
 def _for_each_shadow(program: Callable[..., Any]) -> Callable[..., list[Any]]:
@@ -249,20 +254,17 @@ def _for_each_shadow(program: Callable[..., Any]) -> Callable[..., list[Any]]:
     return run
 
 
-def narrowed(stage: Stage, plan: Plan) -> Plan:
-    """The plan with only what a stage's program depends on, so that nothing else compiles it again."""
-    return Plan(**{name: getattr(plan, name) for name in stage.statics})
-
-
 def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
     """Add a stage's result to what later stages may need. An assignment's counts stay apart from its lists: their
-    shape depends on the tree, and would compile the shading again for every branching. What is evaluated once a
-    cluster leaves the lists."""
+    shape depends on the tree, and would compile the shading again for every branching. So do those of shadows. What is
+    evaluated once a cluster leaves the lists."""
     if stage == "assign":
         env["assign"], env["assign_counts"] = result
         env["listed"] = env["assign"]
     elif stage == "approximate":
         env["assign"], env["cluster_light"] = result
+    elif stage == "shadow_merge":
+        env["shadow_merge"] = [CastMask(mask.shadowed, mask.overflowed) for mask in result]
     else:
         env[stage] = result
 
@@ -274,8 +276,8 @@ def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable
     from its masks to the image.
     """
     stages = REGISTRY[technique].stages_of(plan, has_transparent)
-    casting = tuple(stage for stage in stages if stage.per_shadow)
-    image = _fused(tuple(stage for stage in stages if not stage.per_shadow), replace(plan, shadow=None))
+    casting = tuple(stage for stage in stages if stage.casting)
+    image = _fused(tuple(stage for stage in stages if not stage.casting), replace(plan, shadow=None))
     if not casting:
         return image
     cast = cast_program(technique, plan)
@@ -289,9 +291,7 @@ def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable
 
 def cast_program(technique: str, plan: Plan) -> Callable[[list[ShadowTask]], list[CastMask]]:
     """From view samples to the mask of one light on one view, fused, and run for each of them."""
-    casting = tuple(stage for stage in REGISTRY[technique].stages if stage.per_shadow)
-    if len(casting) == 1:  # the same program: it is compiled once
-        return stage_program(casting[0], narrowed(casting[0], plan))
+    casting = tuple(stage for stage in REGISTRY[technique].stages if stage.casting)
     return _for_each_shadow(_fused_casting(casting, Plan(shadow=plan.shadow)))
 
 
@@ -301,7 +301,8 @@ def _fused_casting(stages: tuple[Stage, ...], plan: Plan) -> Callable[[ShadowTas
         env: dict[str, Any] = {"shadow_tasks": task}
         for stage in stages:
             env[stage.name] = stage.run(plan, *(env[name] for name in stage.needs))
-        return env[stages[-1].name]
+        mask = env[stages[-1].name]
+        return CastMask(mask.shadowed, mask.overflowed)  # alone, so that XLA deletes the counting
 
     return jax.jit(run)
 
@@ -313,7 +314,7 @@ def _fused(stages: tuple[Stage, ...], plan: Plan) -> Callable[..., Any]:
         env = dict(env)
         for stage in stages:
             keep_result(env, stage.name, stage.run(plan, *(env[name] for name in stage.needs)))
-        overflowed = [env[name].overflowed for name in ("clusters", "assign", "shadow_merge") if name in env]
+        overflowed = [env[name].overflowed for name in ("clusters", "assign", "shadow_bits") if name in env]
         return env[stages[-1].name], jax.numpy.stack(overflowed).any() if overflowed else np.bool_(False)
 
     return jax.jit(run)
@@ -345,7 +346,7 @@ def run_stages(
         sizes = replace(sizes, shadow=cast_counted(config, inputs)[1])
     for stage in technique.stages_of(technique.plan(config), inputs.has_transparent):
         while True:
-            plan = narrowed(stage, planned(config, sizes))
+            plan = stage.narrowed(planned(config, sizes))
             result = stage_program(stage, plan)(*(env[name] for name in stage.needs))
             if stage.name == "clusters" and bool(result.overflowed):
                 sizes = replace(sizes, blocks=rounded_up("blocks", int(result.n_blocks)))
@@ -481,8 +482,19 @@ def _count_shadowed(config: Configuration, inputs: FrameInputs, sizes: Sizes | N
 
 def cast_counted(config: Configuration, inputs: FrameInputs) -> tuple[list[CastShadows], tuple[int, ...]]:
     """Shadows of all lights on each view, with tests and counts, and the capacities that hold them."""
-    frames = [receiving(task) for task in inputs.shadows.tasks(config)]
-    plan, masks = fitted_to_all(config.technique, shadow_plan(config), frames)
+    tasks = inputs.shadows.tasks(config)
+    stages = [stage for stage in REGISTRY[config.technique].stages if stage.casting]
+
+    def run(plan: ShadowPlan, i: int) -> ShadowMask:
+        # Stage by stage: those that a setting does not change are compiled, and run, as they are.
+        env: dict[str, Any] = {"shadow_tasks": [tasks[i]]}
+        for stage in stages:
+            program = stage_program(stage, stage.narrowed(Plan(shadow=plan)))
+            env[stage.name] = program(*(env[name] for name in stage.needs))
+        return env[stages[-1].name][0]
+
+    frames = [receiving(task) for task in tasks]
+    plan, masks = fitted_to_all(config.technique, shadow_plan(config), frames, run=run)
     return [on_host(mask, plan, frame) for mask, frame in zip(masks, frames, strict=True)], shadow_sizes(plan)
 
 

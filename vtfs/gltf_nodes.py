@@ -116,6 +116,7 @@ def lights_of(
             )
         where = f"KHR_lights_punctual.lights[{number}]"
         if entries[number].get("type") == "directional":
+            log.warning("%s: is directional; it shines, and casts, with shadow techniques only", where)
             suns.append((*world[:3, 2], *_colour(entries[number], where)))  # it shines along -z
         else:
             rows.append(_light(entries[number], where, world, diagonal_m))

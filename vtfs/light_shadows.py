@@ -53,11 +53,14 @@ class LightShadows(eqx.Module):
         return self.shadowed >> sun.astype(jnp.uint32) & 1 == 0
 
 
-CastMask = tuple[Bool[Array, "visible_runs 32"], Bool[Array, ""]]
-"""Samples of one view that lie in the shadow of one light, and whether that overflowed."""
+class CastMask(eqx.Module):
+    """Samples of one view that lie in the shadow of one light; `overflowed`: it does not hold them all."""
+
+    shadowed: Bool[Array, "visible_runs 32"]
+    overflowed: Bool[Array, ""]
 
 
-def merge_shadows(masks: list[CastMask], slots: ShadowSlots, layers: LayerTable) -> LightShadows:
+def shadow_bits(masks: list[CastMask], slots: ShadowSlots, layers: LayerTable) -> LightShadows:
     """Masks of all lights on each view, as words of all runs.
 
     **Arguments:**
@@ -67,12 +70,12 @@ def merge_shadows(masks: list[CastMask], slots: ShadowSlots, layers: LayerTable)
 
     def words(view: int) -> UInt32[Array, "visible_runs 32"]:
         own = masks[view * slots.n_slots : (view + 1) * slots.n_slots]
-        bits = [mask.astype(jnp.uint32) << jnp.uint32(k) for k, (mask, _) in enumerate(own)]
+        bits = [mask.shadowed.astype(jnp.uint32) << jnp.uint32(k) for k, mask in enumerate(own)]
         return functools.reduce(jnp.bitwise_or, bits)
 
     transparent = jnp.zeros(layers.opacity.shape, jnp.uint32)
     for layer in range(len(masks) // slots.n_slots - 1):
         run = layers.run[layer]
         transparent = transparent.at[jnp.where(run >= 0, run, transparent.shape[0])].set(words(layer + 1), mode="drop")
-    overflowed = jnp.stack([overflowed for _, overflowed in masks]).any()
+    overflowed = jnp.stack([mask.overflowed for mask in masks]).any()
     return LightShadows(slots, jnp.concatenate([words(0), transparent]), overflowed)

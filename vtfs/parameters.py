@@ -180,6 +180,9 @@ PARAMETERS: dict[str, Parameter] = {
             "triangles go on only into nodes that no other one has shadowed as a whole",
             choices=("on", "off"),
         ),
+        Parameter("passes", 1, "walks down the tree: one, or two with a restart at `level`", choices=(1, 2)),
+        Parameter("level", 0, "where the first of two passes ends", low=1, high=24, zero="halfway down the tree"),
+        Parameter("tree", "compact", "over the occupied clusters, or all cells", choices=("compact", "full")),
         Parameter(
             "stencil",
             "unlimited",
@@ -209,7 +212,7 @@ _SHADING = ("gbuffer", "light_cutoff")
 _BRUTE_FORCE = ("assigner", "batch", *_CLUSTERS, *_SHADING, "approximate")
 _TREE = ("branching", "resort_every", "assigner")
 _BY_TREE = (*_TILES, *_SLICES, *_TREE, "batch", *_CLUSTERS, "leaf_test", *_SHADING, "approximate")
-_VOLUMES = ("tile_px", "branching", "batch", "planes", "feedback", "front_faces")
+_VOLUMES = ("tile_px", "branching", "batch", "planes", "feedback", "passes", "level", "front_faces")
 _STENCIL = ("tile_px", "branching", "stencil", "front_faces")
 
 ACCURACY = ("gbuffer", "light_cutoff", "approximate", "front_faces", "stencil", "around_eye")
@@ -229,7 +232,7 @@ TECHNIQUES: dict[str, tuple[str, ...]] = {
     "z_pass": (*_STENCIL, "around_eye", *_SHADING),
     "z_fail": (*_STENCIL, *_SHADING),
     "ptsv": (*_VOLUMES, *_SHADING),
-    "cluster_hierarchy": ("tile_px", "depth_slices", "bounds", *_VOLUMES[1:], *_SHADING),
+    "cluster_hierarchy": ("tile_px", "depth_slices", "bounds", "tree", *_VOLUMES[1:], *_SHADING),
     "shadow_rays": ("front_faces", *_SHADING),
     "brute_force": ("front_faces", *_SHADING),
 }
@@ -388,6 +391,8 @@ def _settled(technique: str, params: dict[str, Value]) -> dict[str, Value]:
                 f"parameter `depth_scheme` = {params['depth_scheme']!r} with depth_slices=0: cubic cells are "
                 "`self_similar`; give depth_slices of 1 or more."
             )
+    if params.get("passes") == 1:
+        default("level")
     if params.get("leaf_test") == "box":
         default("cull")  # the sphere is not tested
     if "cull" in params and "bounds" in params:

@@ -132,8 +132,7 @@ class FrameShadows:
 
     def __init__(self, scene: ShadowScene, samples: ViewSamples, lights: Lights):
         self.scene = scene
-        # Each layer is a view of its own.
-        self.views = (replace(samples, layers=Layers()), *(layer.samples for layer in samples.layers.transparent))
+        self.views = (samples, *(layer.samples for layer in samples.layers.transparent))
         suns = scene.suns
         chosen = brightest_lights(samples, lights, scene.n_lights)
         self.slot = np.full(max(lights.n_lights, 1), -1, np.int32)  # no light at all is one without range
@@ -165,7 +164,8 @@ class FrameShadows:
 
     @cached_property
     def _on_device(self) -> tuple:
-        fragments = [Fragments(view, with_hidden=False) for view in self.views]
+        alone = [replace(view, layers=Layers()) for view in self.views]
+        fragments = [Fragments(view, with_hidden=False) for view in alone]
         positions = [own.positions() for own in fragments]
         return tuple((own, part.gbuffer(own, "float32").normal) for part, own in zip(fragments, positions, strict=True))
 
@@ -189,7 +189,7 @@ class FrameShadows:
         for view in self.views:
             for k in range(len(self.lights)):
                 mask = self.reference(view, k, config.technique, front_faces)
-                masks.append((jax.device_put(to_runs(mask)), np.bool_(False)))
+                masks.append(CastMask(jax.device_put(to_runs(mask)), jax.device_put(np.bool_(False))))
         return masks
 
     def lit_by(self, view: ViewSamples, k: int) -> np.ndarray:

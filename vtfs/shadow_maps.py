@@ -33,7 +33,7 @@ def shadow_maps(config: Configuration, inputs: FrameInputs) -> ShadowMaps | None
     solid, n_slots = shadows.views[0], len(shadows.lights)
     lit = np.sum([shadows.lit_by(solid, k) for k in range(n_slots)], axis=0)
     if config.technique in SHADOW_REFERENCES:
-        masks = [from_runs(np.asarray(mask), inputs.viewport) for mask, _ in shadows.reference_masks(config)[:n_slots]]
+        masks = [from_runs(np.asarray(m.shadowed), inputs.viewport) for m in shadows.reference_masks(config)[:n_slots]]
         return ShadowMaps(lit, np.sum(masks, axis=0), np.zeros_like(lit))
     cast = cast_counted(config, inputs)[0][:n_slots]
     return ShadowMaps(lit, np.sum([c.shadowed for c in cast], axis=0), np.sum([c.tests for c in cast], axis=0))

@@ -63,20 +63,31 @@ def shadow_plan(config: Configuration) -> ShadowPlan:
         batch=int(params.get("batch", 0)),
         stencil=params.get("stencil", "unlimited"),  # type: ignore[arg-type]
         around_eye=params.get("around_eye") == "on",
+        passes=int(params.get("passes", 1)),
+        level=int(params.get("level", 0)),
+        tree=params.get("tree", "compact"),  # type: ignore[arg-type]
     )
 
 
 def shadow_sizes(plan: ShadowPlan) -> tuple[int, ...]:
     """The capacities of a plan, as numbers of which the larger one holds more."""
-    return plan.clusters, plan.groups, plan.leaf_groups, *plan.level_groups
+    return plan.clusters, plan.groups, plan.leaf_groups, plan.pairs, plan.cells, *plan.level_groups
 
 
 def with_shadow_sizes(plan: ShadowPlan, sizes: tuple[int, ...]) -> ShadowPlan:
     """The plan with such capacities; none where they are not known yet."""
     if not sizes:
         return plan
-    clusters, groups, leaf_groups, *level_groups = sizes
-    return replace(plan, clusters=clusters, groups=groups, leaf_groups=leaf_groups, level_groups=tuple(level_groups))
+    clusters, groups, leaf_groups, pairs, cells, *level_groups = sizes
+    return replace(
+        plan,
+        clusters=clusters,
+        groups=groups,
+        leaf_groups=leaf_groups,
+        pairs=pairs,
+        cells=cells,
+        level_groups=tuple(level_groups),
+    )
 
 
 _FIRST = ShadowPlan(clusters=2**12, groups=2**10, leaf_groups=2**13)
@@ -156,14 +167,15 @@ def fitted_to_all(
     plan: ShadowPlan,
     frames: Sequence[ShadowFrame],
     unrolled: bool | None = None,
-    run: Callable[[str, ShadowPlan, ShadowFrame], ShadowMask] = run_program,
+    run: Callable[[ShadowPlan, int], ShadowMask] | None = None,
 ) -> tuple[ShadowPlan, list[ShadowMask]]:
     """The plan with capacities that hold all of several frames, and their masks; see `fitted`.
 
     **Arguments:**
 
-    - `run`: the program to fit, if it is another one over the same tree.
+    - `run`: a plan on one of the frames; by `run_program` unless given.
     """
+    run = run or (lambda plan, i: run_program(technique, plan, frames[i]))
     n_samples = int(np.prod(frames[0].receives.shape))
     n_triangles = frames[0].triangles.shape[0]
     viewport = frames[0].positions.viewport
@@ -180,7 +192,7 @@ def fitted_to_all(
         level_groups=(),
     )
     while True:
-        masks = [run(technique, plan, frame) for frame in frames]
+        masks = [run(plan, i) for i in range(len(frames))]
         needed = np.max([np.asarray(mask.counts.groups) for mask in masks], axis=0).astype(np.int64)
         if not any(bool(mask.overflowed) for mask in masks):
             break
@@ -199,11 +211,16 @@ def fitted_to_all(
             raise InputError(f"{technique}: the frame fits no capacity; use larger tiles or a batch.")
         plan = grown
     if jax.default_backend() != "cpu" if unrolled is None else unrolled:
-        levels = tuple(_rounded_up("lists", int(n), 2**6) for n in needed[1:-1])
-        leaf_groups = _rounded_up("leaf lists", int(needed[-1]), 2**6)
+        levels = tuple(_rounded_up_finely(int(n)) for n in needed[1:-1])
         if levels:
-            plan = replace(plan, level_groups=levels, leaf_groups=leaf_groups, groups=0)
+            plan = replace(plan, level_groups=levels, leaf_groups=_rounded_up_finely(int(needed[-1])), groups=0)
     return plan, masks
+
+
+def _rounded_up_finely(needed: int) -> int:
+    """Eighths of powers of 2: without a loop, what is not needed is computed all the same."""
+    step = 1 << max(6, needed.bit_length() - 4)
+    return max(1, -(-needed // step)) * step
 
 
 def _more(needed: np.integer, capacity: int) -> int:

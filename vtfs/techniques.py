@@ -30,7 +30,7 @@ from vtfs.light_assignment.light_tree import (
 )
 from vtfs.light_culling import Cull, LeafTest, needs_sections
 from vtfs.light_lists import AssignCounts, LightLists, ViewLights
-from vtfs.light_shadows import CastMask, LightShadows, ShadowSlots, merge_shadows
+from vtfs.light_shadows import CastMask, LightShadows, ShadowSlots, shadow_bits
 from vtfs.light_volumes import LightPixels, draw_light_volumes, shade_light_volumes
 from vtfs.morton import morton_codes
 from vtfs.normal_cones import Components, ConeKind
@@ -42,9 +42,9 @@ from vtfs.parameters import (
     passes_only_what_meets_the_box,
 )
 from vtfs.shading import ClusterLight, Image, blend_layers, chunk_blocks, shade
-from vtfs.shadow_inputs import ShadowTask, with_receivers
 from vtfs.shadow_mask import ShadowPlan
-from vtfs.shadow_techniques import SHADOW_TECHNIQUES, shadow_plan
+from vtfs.shadow_stages import CastingStage, casting_stages
+from vtfs.shadow_techniques import shadow_plan
 
 _TESTS_AT_ONCE = {"cpu": 2**19, "gpu": 2**22}
 """`batch = 0` means all queries at once, as far as their rows of boxes stay in the cache of a CPU (12 MB) or leave
@@ -100,7 +100,7 @@ class Stage:
       earlier stages. `listed` are the lists as assigned, `assign` those without what is evaluated once a cluster, and
       `cluster_light` is that, or None.
     - `statics`: the fields of `Plan` that its program depends on.
-    - `per_shadow`: it runs once for each light that casts and each view, in float64: what it needs and its results are
+    - `casting`: it runs once for each light that casts and each view, in float64: what it needs and its results are
       lists.
     """
 
@@ -108,7 +108,13 @@ class Stage:
     run: Callable[..., Any]
     needs: tuple[str, ...]
     statics: tuple[str, ...] = ()
-    per_shadow: bool = False
+    casting: CastingStage | None = None
+
+    def narrowed(self, plan: Plan) -> Plan:
+        """The plan with only what the stage's program depends on, so that nothing else compiles it again."""
+        if self.casting and plan.shadow:
+            return Plan(shadow=self.casting.narrowed(plan.shadow))
+        return Plan(**{name: getattr(plan, name) for name in self.statics})
 
 
 Lists = Literal["clusters", "light_volumes", "none"]
@@ -135,7 +141,7 @@ class Technique:
 
     @property
     def casts_shadows(self) -> bool:
-        return any(stage.name == "shadow_merge" for stage in self.stages)
+        return any(stage.name == "shadow_bits" for stage in self.stages)
 
     def plan(self, config: Configuration) -> Plan:
         """The static part of a configuration, without capacities."""
@@ -328,14 +334,8 @@ def _shade_transparent(
     return blend_layers(solid, colour, layers)
 
 
-def _cast(technique: str, plan: Plan, task: ShadowTask) -> CastMask:
-    assert plan.shadow is not None
-    mask = SHADOW_TECHNIQUES[technique](with_receivers(task), plan.shadow)
-    return mask.shadowed, mask.overflowed
-
-
-def _merge_shadows(plan: Plan, masks: list[CastMask], slots: ShadowSlots, layers: LayerTable) -> LightShadows:
-    return merge_shadows(masks, slots, layers)
+def _shadow_bits(plan: Plan, masks: list[CastMask], slots: ShadowSlots, layers: LayerTable) -> LightShadows:
+    return shadow_bits(masks, slots, layers)
 
 
 def _shade_shadowed(
@@ -442,24 +442,36 @@ def _deferred(name: str, stencil: bool) -> Technique:
     return Technique(name, stages, lists="light_volumes", reads_gbuffer="per_light")
 
 
-_MERGE_SHADOWS = Stage("shadow_merge", _merge_shadows, ("shadow_traverse", "shadow_slots", "layers"))
+_SHADOW_BITS = Stage("shadow_bits", _shadow_bits, ("shadow_merge", "shadow_slots", "layers"))
 _SHADE_SHADOWED = (
-    Stage("shade_opaque", _shade_shadowed, ("gbuffer", *_LIGHTS, "clusters", "assign", "shadow_merge"), ("batch",)),
+    Stage("shade_opaque", _shade_shadowed, ("gbuffer", *_LIGHTS, "clusters", "assign", "shadow_bits"), ("batch",)),
     Stage(
         "shade_transparent",
         _shade_transparent_shadowed,
-        ("gbuffer", "layers", *_LIGHTS, "shade_opaque", "clusters", "assign", "shadow_merge"),
+        ("gbuffer", "layers", *_LIGHTS, "shade_opaque", "clusters", "assign", "shadow_bits"),
         ("batch",),
     ),
 )
 
 
+def _casting(name: str) -> tuple[Stage, ...]:
+    """The stages of casting, of references none: they bring their masks from the host."""
+    if name in SHADOW_REFERENCES:
+        return ()
+
+    def run(casting: CastingStage, plan: Plan, *inputs: Any) -> Any:
+        assert plan.shadow is not None
+        return casting.run(plan.shadow, *inputs)
+
+    return tuple(
+        Stage(casting.name, functools.partial(run, casting), casting.needs, ("shadow",), casting)
+        for casting in casting_stages(name)
+    )
+
+
 def _shadowed(name: str) -> Technique:
-    """Masks of all lights that cast, then clustered shading. References bring their masks from the host."""
-    run = functools.partial(_cast, name)
-    cast = Stage("shadow_traverse", run, ("shadow_tasks",), ("shadow",), per_shadow=True)
-    casting = (_MERGE_SHADOWS,) if name in SHADOW_REFERENCES else (cast, _MERGE_SHADOWS)
-    stages = (_CLUSTERS, *_ASSIGN_BY_TREE, *casting, *_SHADE_SHADOWED)
+    """Light lists, the shadow of each light that casts, and shading by both."""
+    stages = (_CLUSTERS, *_ASSIGN_BY_TREE, *_casting(name), _SHADOW_BITS, *_SHADE_SHADOWED)
     return Technique(name, stages, reads_gbuffer="per_sample")
 
 

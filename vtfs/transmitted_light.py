@@ -107,7 +107,7 @@ def transmitted_light(
         with jax.enable_x64(True):
             return alpha_program(technique, plan, blending)(frame, surfaces, jnp.asarray(words))
 
-    plan, _ = fitted_to_all(technique, plan, [frame], run=lambda _technique, plan, _frame: found(plan).mask)
+    plan, _ = fitted_to_all(technique, plan, [frame], run=lambda plan, _: found(plan).mask)
     transmitted = found(plan)
     alpha = on_host(transmitted.mask, plan, frame)
     stopped = opaque.shadowed | alpha.shadowed

@@ -23,7 +23,7 @@ def at(frame):
 
 
 def inputs_of(frame):
-    return FrameInputs(SAMPLES, at(frame), frame, lambda i: view_lights(at(i), SAMPLES.camera))
+    return FrameInputs(SAMPLES, at(frame), frame=frame, earlier_lights=lambda i: view_lights(at(i), SAMPLES.camera))
 
 
 def config(resort_every):

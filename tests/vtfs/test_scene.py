@@ -161,7 +161,7 @@ def test_point_and_spot_lights_are_placed_and_get_a_range(tmp_path, caplog):
     lights = [
         {"type": "point", "color": [1, 0.5, 0], "intensity": 8, "range": 3},
         {"type": "spot", "intensity": 0.01, "spot": {"innerConeAngle": 0.1, "outerConeAngle": 0.2}},
-        {"type": "directional"},
+        {"type": "directional", "color": [1, 0.5, 2], "intensity": 0.5},
         {"type": "point", "intensity": 1e9},
     ]
     nodes = [{"mesh": 0}] + [
@@ -178,6 +178,8 @@ def test_point_and_spot_lights_are_placed_and_get_a_range(tmp_path, caplog):
     assert_allclose(scene.lights.cos_outer, (-2, np.cos(0.2), -2))
     assert_allclose(scene.lights.range_m, (3, 1, scene.diagonal_m))
     assert "has no range" in caplog.text and "directional" in caplog.text
+    assert_allclose(scene.suns.toward, [(0, 0, 1)])  # it shines along -z of its node
+    assert_allclose(scene.suns.colour, [(0.5, 0.25, 1)])
 
 
 def test_external_buffers_and_images_inside_the_folder_are_read(tmp_path):

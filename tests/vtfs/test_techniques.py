@@ -22,15 +22,20 @@ from tests.strategies import (
 )
 from vtfs.camera import Lens
 from vtfs.frame import FrameInputs, image_on_host, render, run_stages
-from vtfs.parameters import TECHNIQUES, configuration
+from vtfs.parameters import SHADOW_REFERENCES, TECHNIQUES, configuration
 from vtfs.reference import forward_reference, largest_relative_difference
 from vtfs.techniques import REGISTRY
 
 few = settings(max_examples=5, deadline=None)
 DISTINCT = tuple(
-    {replace(technique, name="", reads_gbuffer="never"): name for name, technique in REGISTRY.items()}.values()
+    {
+        replace(technique, name="", reads_gbuffer="never"): name
+        for name, technique in REGISTRY.items()
+        if not technique.casts_shadows
+    }.values()
 )
-"""One technique of each kind of frame: those that differ only in what is rasterised run the same programs."""
+"""One technique of each kind of frame: those that differ only in what is rasterised run the same programs. Shadowed
+frames have tests of their own."""
 
 BATCH = 1024  # a walk with small chunks takes little time on a small image
 
@@ -165,6 +170,8 @@ def test_the_registry_and_the_parameters_name_the_same_techniques():
         assert technique.name == name and technique.stages[-1].name == "shade_transparent"
         known = {"positions", "gbuffer", "layers", "grid", "normals", "lights", "light_cutoff"}
         known |= {"approximate", "cluster_light", "listed", "old_order", "frame", "resort_every"}
+        if technique.casts_shadows:
+            known |= {"shadow_slots", "shadow_merge" if name in SHADOW_REFERENCES else "shadow_tasks"}
         for stage in technique.stages:
             assert set(stage.needs) <= known
             known.add(stage.name)

@@ -1,0 +1,172 @@
+"""Shadowed images: each light that casts, directional ones too, on solid samples and transparent layers."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from tests import oracles
+from tests.strategies import a_camera, layered_samples, nearby_lights, surface_samples
+from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
+from vtfs.frame import FrameInputs, count, image_on_host, render, run_stages
+from vtfs.input_error import InputError
+from vtfs.light_shadows import CastMask, shadow_bits
+from vtfs.lights import Lights, point_lights
+from vtfs.parameters import SHADOW_REFERENCES, TECHNIQUES, configuration
+from vtfs.reference import ViewShadows, forward_reference, largest_relative_difference
+from vtfs.shadow_casters import Casters
+from vtfs.shadow_inputs import FrameShadows, ShadowScene, brightest_lights
+from vtfs.shadow_maps import shadow_maps
+from vtfs.view_samples import ViewSamples
+
+SUNS = DirectionalLights(np.array([[0.3, 1.0, 0.4], [-2.0, 0.5, 0.0]]), np.array([[1.0, 0.9, 0.7], [0.2, 0.3, 0.6]]))
+NOTHING = Casters(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+CAST = configuration("cluster_hierarchy", {"branching": 8})
+"""Of the walks only one, and only from points: each compiles for seconds. `test_shadow_mask` has the others."""
+
+
+def between(samples: ViewSamples, lights: Lights, seed: int, n: int = 200) -> Casters:
+    """Triangles on the way from visible samples to lights that reach them."""
+    rng = np.random.default_rng(seed)
+    at = samples.world_positions_m()
+    reached = np.linalg.norm(at[:, None] - lights.position_m, axis=-1) < lights.range_m
+    sample, light = np.argwhere(reached)[rng.integers(0, reached.sum(), n)].T
+    way = lights.position_m[light] - at[sample]
+    middle = at[sample] + rng.uniform(0.2, 0.8, (n, 1)) * way
+    size = 0.4 * np.linalg.norm(way, axis=1)[:, None, None]
+    corners = middle[:, None] + size * rng.normal(size=(n, 3, 3))
+    return Casters(corners.reshape(-1, 3), np.arange(3 * n).reshape(n, 3))
+
+
+def a_frame(seed: int, suns: DirectionalLights = SUNS, n_lights: int = 3) -> FrameInputs:
+    samples = layered_samples(a_camera(), seed)
+    lights = nearby_lights(samples, 37, seed)
+    return FrameInputs(samples, lights, shadow_scene=ShadowScene(between(samples, lights, seed), suns, n_lights))
+
+
+def reference_of(inputs: FrameInputs, lights, technique: str = "brute_force") -> np.ndarray:
+    shadows = inputs.shadows
+    masks = [
+        [shadows.reference(view, k, technique, "cast") for k in range(len(shadows.lights))] for view in shadows.views
+    ]
+    own = [ViewShadows(shadows.slot, np.array(of_view), shadows.scene.suns) for of_view in masks]
+    return forward_reference(inputs.samples, lights, own)
+
+
+def slow_image(inputs: FrameInputs, lights: Lights) -> np.ndarray:
+    """By the oracle, which knows no shadows and no directional lights: these are points 1e7 m away, right to 1e-5, and
+    each light is listed only where brute force leaves a sample lit. Layers pixel by pixel."""
+    shadows, suns = inputs.shadows, inputs.shadows.scene.suns
+    far_m, eye_m = 1e7, np.array(inputs.camera.eye_m)
+    far = point_lights(eye_m + far_m * suns.toward, np.full(suns.n_lights, 1e6 * far_m), far_m**2 * suns.colour)
+    everything = Lights(*(np.concatenate([getattr(each, f.name) for each in (lights, far)]) for f in fields(lights)))
+    of_slot = [*range(lights.n_lights, everything.n_lights), *np.argsort(np.where(shadows.slot < 0, 99, shadows.slot))]
+    images = []
+    for view in shadows.views:
+        listed = np.ones((*view.valid.shape, everything.n_lights), bool)
+        for k in range(len(shadows.lights)):
+            listed[..., of_slot[k]] = ~shadows.reference(view, k, "brute_force", "cast")
+        images.append(oracles.image(view, everything, listed=listed))
+    total, *colours = images
+    for y, x in np.ndindex(total.shape[:2]):
+        for layer, colour in reversed(list(zip(inputs.samples.layers.transparent, colours, strict=True))):
+            opacity = float(layer.opacity[y, x])
+            total[y, x] = opacity * colour[y, x] + (1 - opacity) * total[y, x]
+    return total
+
+
+def test_a_shadowed_image_is_the_sum_of_what_each_light_reaches():
+    inputs = a_frame(3)
+    lights = nearby_lights(inputs.samples, 37, 3)
+    expected = slow_image(inputs, lights)
+    image = render(configuration("brute_force"), inputs)
+    assert largest_relative_difference(image, expected, inputs.seen()) < 1e-4  # as of any image
+    reference = reference_of(inputs, lights)
+    assert largest_relative_difference(reference, expected, inputs.seen()) < 2e-5  # the far points
+    lit = FrameInputs(inputs.samples, lights, shadow_scene=ShadowScene(NOTHING, SUNS, 3))
+    unshadowed = render(configuration("brute_force"), lit)
+    assert largest_relative_difference(unshadowed, expected, inputs.seen()) > 0.1
+
+
+def test_a_technique_makes_the_image_that_the_references_make():
+    inputs = a_frame(4, NO_DIRECTIONAL)
+    image, expected = (render(c, inputs).astype(np.float64) for c in (CAST, configuration("brute_force")))
+    maps = shadow_maps(CAST, inputs)
+    assert 0.05 < maps.shadowed.sum() / maps.lit.sum() < 0.95
+    # Pixels in which rounding decides one of three masks: a few of 561.
+    off = np.abs(image - expected).max(axis=-1) > 1e-4 * expected.mean()
+    assert off.sum() <= 0.01 * off.size
+    stages, _ = run_stages(CAST, inputs)
+    by_stages = image_on_host(stages["shade_transparent"], inputs).astype(np.float64)
+    assert largest_relative_difference(image, by_stages, inputs.seen()) < 1e-6
+
+
+def test_counts_are_of_all_lights_and_views():
+    inputs = a_frame(4, NO_DIRECTIONAL)
+    counts = count(CAST, inputs)[0].of(CAST)
+    lists = configuration("clustered_deferred")
+    alone = count(lists, inputs)[0].of(lists)
+    assert counts["shadow_lights"] == 3 and counts["casters"] <= inputs.shadows.scene.casters.n_triangles
+    assert counts["lighting_computations"] == alone["lighting_computations"]
+    rays = configuration("shadow_rays")
+    with_suns = count(rays, a_frame(4))[0].of(rays)
+    assert with_suns["lighting_computations"] == alone["lighting_computations"] + 2 * alone["samples"]
+    assert counts["test_and_set"] == counts["node_tests"] + counts["sample_tests"] > 0
+    assert counts["tests_of_largest"] <= counts["test_and_set"]
+    shadows = inputs.shadows
+    lit = sum(int(shadows.lit_by(view, k).sum()) for view in shadows.views for k in range(3))
+    assert abs(counts["shadow_samples"] - lit) <= 5  # float32 decides where a surface turns away
+    assert counts["memory"] > alone["memory"]
+
+
+def test_bits_of_a_layer_lie_at_its_own_runs():
+    inputs = a_frame(5, NO_DIRECTIONAL, 2)
+    layers, n_visible = inputs.layers, inputs.positions(False).n_visible_runs
+    n_views = len(inputs.shadows.views)
+    rng = np.random.default_rng(0)
+    masks = rng.random((n_views, 2, n_visible, 32)) < 0.5
+    found = shadow_bits(
+        [CastMask(m, np.bool_(False)) for m in masks.reshape(-1, n_visible, 32)], inputs.shadows.slots, layers
+    )
+    words = np.asarray(found.shadowed)
+    assert (words[:n_visible] == masks[0, 0] + 2 * masks[0, 1]).all()
+    run = np.asarray(layers.run)
+    for layer in range(n_views - 1):
+        there = np.flatnonzero(run[layer] >= 0)
+        own = words[n_visible + run[layer, there]]
+        assert len(there) and (own == masks[layer + 1, 0, there] + 2 * masks[layer + 1, 1, there]).all()
+
+
+def test_the_lights_that_cast_are_those_that_light_the_view_most():
+    samples = surface_samples(a_camera(), 1)
+    lights = nearby_lights(samples, 37, 1, spots=True)
+    white = []
+    for i in range(lights.n_lights):
+        listed = np.zeros((*samples.valid.shape, lights.n_lights), bool)
+        black = oracles.image(samples, lights, listed=listed)
+        listed[..., i] = True
+        white.append(float((oracles.image(samples, lights, listed=listed) - black)[samples.valid].sum()))
+    order = brightest_lights(samples, lights, 37)
+    # Irradiance is not what a material reflects of it: the ranks agree, not the order.
+    assert {int(i) for i in order[:8]} <= {int(i) for i in np.argsort(white)[::-1][:16]}
+    assert set(order) == {i for i, light in enumerate(white) if light > 0}
+
+
+def test_without_geometry_or_lights_shadows_are_refused():
+    samples = surface_samples(a_camera(), 1)
+    lights = nearby_lights(samples, 3, 1)
+    with pytest.raises(InputError, match="need the triangles of a scene"):
+        render(configuration("ptsv"), FrameInputs(samples, lights))
+    casters = between(samples, lights, 0)
+    with pytest.raises(InputError, match="--shadow-lights 31: with 2 directional lights must be from 0 to 30"):
+        ShadowScene(casters, SUNS, 31)
+    with pytest.raises(InputError, match="no light casts a shadow"):
+        FrameShadows(ShadowScene(casters, NO_DIRECTIONAL, 0), samples, lights)
+    with pytest.raises(InputError, match="directional light 1 `toward`"):
+        DirectionalLights(np.array([[1.0, 0, 0], [0, 0, 0]]), np.ones((2, 3)))
+
+
+def test_every_shadow_technique_has_the_stages_of_its_frame():
+    for name in ("z_pass", "z_fail", "ptsv", "cluster_hierarchy"):
+        assert {"tile_px", "branching", "front_faces"} <= set(TECHNIQUES[name])
+    assert set(SHADOW_REFERENCES) < set(TECHNIQUES)
