@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, UInt32
 
 from vtfs.alpha_casters import AlphaSurfaces, Blending, SceneCasters, alpha_on_device
-from vtfs.gbuffer import from_runs
+from vtfs.gbuffer import Fragments, from_runs
 from vtfs.input_error import InputError
 from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight
 from vtfs.shadow_mask import ShadowFrame, ShadowPlan, casters_on_device, shadow_frame
@@ -118,3 +118,25 @@ def transmitted_light(
         left = channels[0] if blending == "grey" else np.stack(channels, axis=-1)
         left = np.where(stopped if left.ndim == 2 else stopped[..., None], np.float32(0), left)
     return TransmittedLight(left, opaque, alpha)
+
+
+def views_of(samples: ViewSamples) -> tuple[ViewSamples, ...]:
+    """What receives shadow on a frame: the solid samples, then each transparent layer; a view each."""
+    return (samples, *(layer.samples for layer in samples.layers.transparent))
+
+
+def in_fragments(samples: ViewSamples, images: Sequence[np.ndarray]) -> np.ndarray:
+    """Images of `views_of` a frame in the runs in which it is shaded: visible ones, then transparent ones.
+
+    **Arguments:**
+
+    - `images`: one a view, `[h, w]` or `[h, w, channels]`.
+
+    **Returns:** `[runs, 32]` or `[runs, 32, channels]`; 0 in the padding.
+    """
+    of_view = {id(view): image for view, image in zip(views_of(samples), images, strict=True)}
+    fragments = Fragments(samples, with_hidden=False)
+    if images[0].ndim == 2:
+        return fragments.channel(lambda view: of_view[id(view)])
+    channels = range(images[0].shape[2])
+    return np.stack([fragments.channel(lambda view, c=c: of_view[id(view)][..., c]) for c in channels], axis=-1)

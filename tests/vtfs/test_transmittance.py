@@ -20,7 +20,7 @@ from tests.vtfs.test_shadow_mask import CLUSTERS, N_TRIANGLES, N_VERTICES, TILES
 from vtfs.alpha_casters import AlphaCasters, Blending, alpha_on_device, scene_casters
 from vtfs.camera import Camera, Viewport
 from vtfs.gallery import build_scene
-from vtfs.gbuffer import from_runs
+from vtfs.gbuffer import Fragments, from_runs
 from vtfs.input_error import InputError
 from vtfs.random_words import random_words
 from vtfs.shadow_casters import Casters, ShadowLight
@@ -28,7 +28,7 @@ from vtfs.shadow_mask import ShadowPlan, casters_on_device, default_bias_m, faci
 from vtfs.shadow_references import brute_force, classify, view_points_m
 from vtfs.shadow_techniques import shadow_grid
 from vtfs.transmittance_references import brute_force_transmittance
-from vtfs.transmitted_light import alpha_program, scene_bias_m, transmitted_light
+from vtfs.transmitted_light import alpha_program, in_fragments, scene_bias_m, transmitted_light, views_of
 from vtfs.view_samples import ViewSamples, trace_view_samples
 
 some = settings(max_examples=4, deadline=None)
@@ -218,7 +218,7 @@ def test_a_conservatory_and_its_panes_receive_the_light_that_float64_says():
     n_blended, n_in_bands, n = 0, 0, 0
     plan = ShadowPlan(8, 8)
     # Receivers are what is seen, and the panes before it: a view each.
-    for number, view in enumerate((samples, *(layer.samples for layer in layers[:2]))):
+    for number, view in enumerate(views_of(samples)[:3]):
         receives = facing_samples(view, light)
         found = transmitted_light("ptsv", plan, view, casters, light, receives=receives, stream=(0, number))
         points = view_points_m(view, receives)
@@ -234,6 +234,18 @@ def test_a_conservatory_and_its_panes_receive_the_light_that_float64_says():
         n_blended += ((expected > 0) & (expected < 1)).sum()
         n += len(points)
     assert n_blended > 0.3 * n and n_in_bands <= 1e-3 * n
+
+
+def test_what_views_receive_is_put_where_their_fragments_are_shaded():
+    samples, _, _ = conservatory()
+    images = [view.position_m for view in views_of(samples)]
+    fragments = Fragments(samples, with_hidden=False)
+    positions = fragments.positions()
+    assert positions.n_transparent_runs > 0
+    found = in_fragments(samples, images)
+    for c, component in enumerate((positions.x_m, positions.y_m, positions.z_m)):
+        assert (found[..., c] == np.asarray(component)).all()
+        assert (in_fragments(samples, [image[..., c] for image in images]) == np.asarray(component)).all()
 
 
 @pytest.mark.parametrize(
