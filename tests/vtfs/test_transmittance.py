@@ -152,9 +152,12 @@ def test_each_closed_shell_counts_exactly_once_at_vertices_and_edges_too(techniq
         nearest_m = np.linalg.norm(points - light_m, axis=1).min()
         shells = shells_toward(points[rng.choice(len(points), 40, False)], light_m, (0.2 * nearest_m, 0.6 * nearest_m))
         alpha = np.repeat([0.25, 0.8, 0.5], [88, 88, N_TRIANGLES - 176])
+        # Triangles without area have an image in one variant and not in the other: with none at all it is left out of
+        # the program.
+        image = np.where(np.arange(N_TRIANGLES) < 176, -1, 0 if blending == "coloured" else -1)
         casters = replace(
             made_of(shells, rng), opacity=alpha, cutoff=np.full(N_TRIANGLES, np.nan), tint=np.zeros((N_TRIANGLES, 3)),
-            image=np.full(N_TRIANGLES, -1),
+            image=image,
         )  # fmt: skip
         left = left_by((technique, plan, blending), samples, casters, ShadowLight(tuple(light_m)), 0.0)
         # Twice or not at all would be 0.2 or 0.75 times that, or more.
