@@ -39,7 +39,7 @@ def kept_casters(casters: Casters, light: ShadowLight, front_faces: FrontFaces) 
     return Casters(casters.vertices_m, casters.triangles[~facing_light(casters, light)])
 
 
-def _moved(points_m: np.ndarray, light: np.ndarray, bias_m: float) -> tuple[np.ndarray, np.ndarray]:
+def moved_points(points_m: np.ndarray, light: np.ndarray, bias_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Points moved toward the light by the bias, at most onto it; and the way from there to the light."""
     if light[3] == 0:
         moved = points_m + bias_m * light[:3]
@@ -70,8 +70,8 @@ def brute_force(
     if not casters.n_triangles or not len(points_m):
         return shadowed
     homogeneous = light.homogeneous - np.append(origin, 0) * light.homogeneous[3]
-    moved, _ = _moved(points_m, homogeneous, bias_m)
-    planes, behind = _volume_planes(casters, origin, homogeneous)
+    moved, _ = moved_points(points_m, homogeneous, bias_m)
+    planes, behind = volume_planes(casters, origin, homogeneous)
     moved = moved if light.directional else moved - homogeneous[:3]
     n_points = max(1, min(len(points_m), _PAIRS_AT_ONCE // casters.n_triangles))
 
@@ -90,7 +90,7 @@ def brute_force(
     return shadowed
 
 
-def _volume_planes(
+def volume_planes(
     casters: Casters, origin_m: np.ndarray, light: np.ndarray
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
     """Inward normals `[T, 3]` of the three side planes and the triangle's, and the products that points inside exceed.
@@ -141,7 +141,7 @@ class ShadowRays:
             return np.zeros(len(points_m), bool)
         origin = np.zeros(3) if origin_m is None else np.asarray(origin_m, np.float64)
         homogeneous = light.homogeneous
-        start, way = _moved(points_m, homogeneous - np.append(origin, 0) * homogeneous[3], bias_m)
+        start, way = moved_points(points_m, homogeneous - np.append(origin, 0) * homogeneous[3], bias_m)
         if light.directional:
             way = way * (4 * self._extent_m + 4 * np.abs(start + origin - self._middle_m).max())
         start = np.ascontiguousarray(start + (origin - self._middle_m), np.float32)

@@ -214,8 +214,8 @@ class Planes:
         offset = (normal * v0).sum(axis=1)
         self.scene, self._camera = scene, camera
         self.row = np.column_stack([normal, offset, depths.min(axis=0), depths.max(axis=0)])
-        masked = np.array([m.alpha_mode == "mask" and m.alpha_image is not None for m in scene.materials])
-        textured = np.flatnonzero(masked[scene.material_index])
+        has_image = np.array([material.alpha_image is not None for material in scene.materials])
+        textured = np.flatnonzero(has_image[scene.material_index])
         self._uv_row = np.zeros((0, 8))
         if scene.uv is not None and len(textured):
             self._row_of = np.zeros(scene.n_triangles, np.int32)
@@ -239,23 +239,31 @@ class Planes:
 
     def is_opaque(self, triangle: np.ndarray, x: np.ndarray, y: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
         """Alpha test where rays meet triangles at given depths, bool `[N]`; without an alpha test it is passed."""
+        materials = self.scene.materials
+        cutoff = np.array([m.alpha_cutoff if m.alpha_mode == "mask" else -np.inf for m in materials])
+        masked = np.flatnonzero(np.isfinite(cutoff)[self.scene.material_index[triangle]])
         opaque = np.ones(len(triangle), bool)
+        at = triangle[masked]
+        alpha = self.alpha(at, x[masked], y[masked], depth_m[masked])
+        opaque[masked] = alpha >= cutoff[self.scene.material_index[at]]
+        return opaque
+
+    def alpha(self, triangle: np.ndarray, x: np.ndarray, y: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+        """`opacity * alpha_image` where rays meet triangles at given depths, float64 `[N]`."""
         index = self.scene.material_index[triangle]
+        alpha = np.array([material.opacity for material in self.scene.materials])[index]
         for m in np.flatnonzero(np.bincount(index, minlength=len(self.scene.materials))):
-            material = self.scene.materials[m]
-            if material.alpha_mode != "mask":
+            image = self.scene.materials[m].alpha_image
+            if image is None or self.scene.uv is None:
                 continue
             here = np.flatnonzero(index == m)
-            if material.alpha_image is None or self.scene.uv is None:
-                opaque[here] = material.opacity >= material.alpha_cutoff
-                continue
             row = self._uv_row[self._row_of[triangle[here]]]
             width = self._camera.width_at(depth_m[here])
             rx, ry, rz = x[here] * width, y[here] * width, -depth_m[here]
             u = row[:, 0] * rx + row[:, 1] * ry + row[:, 2] * rz + row[:, 3]
             v = row[:, 4] * rx + row[:, 5] * ry + row[:, 6] * rz + row[:, 7]
-            opaque[here] = material.opacity * _bilinear(material.alpha_image, u, v) >= material.alpha_cutoff
-        return opaque
+            alpha[here] *= bilinear(image, u, v)
+        return alpha
 
 
 def _uv_rows(corners: tuple[np.ndarray, np.ndarray, np.ndarray], normal: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -275,7 +283,7 @@ def _uv_rows(corners: tuple[np.ndarray, np.ndarray, np.ndarray], normal: np.ndar
     return rows
 
 
-def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """An image at texture coordinates, repeated; texel centres lie at `(i + 1/2) / n`."""
     height, width = image.shape
     with np.errstate(invalid="ignore"):  # a triangle without area has any coordinates
