@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from reports import number_text
 from reports.recommendation import Setting
 from reports.run_folder import RunFolder, StageModel, Timed, frame_medians_ms
+from tuning.features import main_work
 from tuning.measurement import Measurement
 from vtfs.parameters import PARAMETERS, Value
 
@@ -21,7 +22,19 @@ COUNT_MEANINGS = {
     "leaf_tests": "tests of single lights",
     "lighting_computations": "one light evaluated for one sample",
     "lighting_computations_tile_area": "the same as tile area times list length (2011 paper)",
-    "test_and_set": "existing nodes or samples tested against a triangle",
+    "shadow_lights": "lights that cast shadows",
+    "shadow_samples": "samples that they would light",
+    "casters": "triangles with a shadow volume",
+    "shadow_clusters": "tiles or clusters of these samples",
+    "test_and_set": "existing nodes or samples tested against a triangle; with a stencil, updates of it",
+    "test_and_set_in_cluster": "the same, of a tile only the samples of the cluster",
+    "node_tests": "nodes tested against a triangle",
+    "sample_tests": "samples tested against a triangle",
+    "dropped_nodes": "tests of nodes that feedback spares",
+    "dropped_samples": "tests of samples that feedback spares",
+    "tests_of_largest": "tests of the 1,024 triangles with the most: how unevenly the work lies",
+    "listed_pairs": "entries of all lists of triangles",
+    "longest_shadow_list": "triangles tested against one tile or cluster, at most",
     "extra_plane_tests": "tests of the extra planes",
     "bytes_moved": "bytes read and written",
     "memory": "bytes held",
@@ -113,7 +126,11 @@ def measurement_table(run: RunFolder) -> MeasurementTable:
         ("slowest frame, ms", "median over the repeats of the slowest of the measured frames", True),
         ("mean, ms", "mean over the measured frames of their medians", True),
         ("error", "RMSE over RMS of the float64 reference image", True),
-        ("lighting computations", "lights times samples, on the frame with the most", True),
+        (
+            ("shadow tests", "nodes and samples tested against triangles, on the frame with the most", True)
+            if run.casts_shadows
+            else ("lighting computations", "lights times samples, on the frame with the most", True)
+        ),
         ("compile, s", "time to compile the programs of this configuration", True),
         ("outcome", "", False),
     )
@@ -125,7 +142,7 @@ def _row(number: int, line: Measurement, varying: list[str], best: Timed | None)
     medians_ms = frame_medians_ms(line)
     slowest_ms = max(medians_ms, default=None)
     mean_ms = sum(medians_ms) / len(medians_ms) if medians_ms else None
-    computations = line.counts[0].get("lighting_computations") if line.counts else None
+    work = main_work(line.counts[0]) if line.counts else None
     cells = (
         Cell(str(number), number, is_number=True),
         Cell(line.technique, line.technique, is_code=True),
@@ -133,7 +150,7 @@ def _row(number: int, line: Measurement, varying: list[str], best: Timed | None)
         _number_cell(slowest_ms, number_text.digits),
         _number_cell(mean_ms, number_text.digits),
         _number_cell(line.error, number_text.error),
-        _number_cell(computations, number_text.count),
+        _number_cell(work, number_text.count),
         _number_cell(line.compile_s if math.isfinite(line.compile_s) else None, lambda value: f"{value:.1f}"),
         Cell(line.outcome.replace("_", " "), line.outcome),
     )

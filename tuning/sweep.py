@@ -20,12 +20,13 @@ from tuning.choose import (
     time_ms,
 )
 from tuning.cost_model import CostModel
+from tuning.features import main_work
 from tuning.measurement import Measurement
 from tuning.record import append_measurement, read_measurements
 from tuning.select import fit_models, fit_stage
 from tuning.space import Space, accuracy_values
 from vtfs.input_error import InputError
-from vtfs.parameters import Configuration, configuration, exact_configuration, is_exact
+from vtfs.parameters import SHADOW_NAMES, Configuration, Value, configuration, exact_configuration, is_exact
 
 HOPELESS = 12
 """A technique whose default needs this many times the lighting computations of the thriftiest is not measured."""
@@ -169,7 +170,7 @@ def search(
     design = initial_design(hopeful, run.counts, seed)
     defaults, spread = design[: len(hopeful.techniques)], design[len(hopeful.techniques) :]
     # Thrifty ones first: what is there to beat is then known when the slow ones are measured.
-    in_budget = all(run.measure(candidate) for candidate in sorted(defaults, key=run.lighting_computations))
+    in_budget = all(run.measure(candidate) for candidate in sorted(defaults, key=run.main_work))
     explored, not_explored = _explored(hopeful, run)
 
     share = 1 - _ACCURACY_SHARE
@@ -264,8 +265,8 @@ class _Run:
                 self._record(candidate, None)
         return self._counts[candidate]
 
-    def lighting_computations(self, candidate: Configuration) -> int:
-        return sum(frame.get("lighting_computations", 0) for frame in self.counts(candidate))
+    def main_work(self, candidate: Configuration) -> int:
+        return sum(map(main_work, self.counts(candidate)))
 
     def measure(self, candidate: Configuration, share: float = 1.0) -> bool:
         """Measure and record it, unless that was done; False where the budget's `share` was used up before."""
@@ -361,10 +362,11 @@ def _hopeful(space: Space, run: _Run, keep: Collection[str]) -> tuple[Space, dic
     excluded = dict.fromkeys(unreachable, "the constraints leave no configuration of it")
     space = space.limited_to(reachable)
     defaults = {name: configuration(name) for name in space.techniques}
-    work = {name: run.lighting_computations(default) for name, default in defaults.items() if run.counts(default)}
+    work = {name: run.main_work(default) for name, default in defaults.items() if run.counts(default)}
     least = min(work.values(), default=0)
+    unit = "tests" if set(space.techniques) & set(SHADOW_NAMES) else "lighting computations"
     reasons = {
-        name: f"its default needs {work[name] / least:.0f} times the lighting computations of "
+        name: f"its default needs {work[name] / least:.0f} times the {unit} of "
         f"{min(work, key=work.__getitem__)}'s ({work[name]:,} and {least:,})"
         for name in work
         if least > 0 and work[name] > HOPELESS * least and name not in keep
@@ -389,7 +391,8 @@ def _explored(space: Space, run: _Run) -> tuple[Space, dict[str, str]]:
 
 
 def _less_accurate(exact: Configuration) -> list[Configuration]:
-    settings = ({"gbuffer": gbuffer, "light_cutoff": cutoff} for gbuffer, cutoff in accuracy_values())
+    settings: list[dict[str, Value]] = [{"front_faces": "culled"}, {"stencil": "wrap"}]
+    settings += ({"gbuffer": gbuffer, "light_cutoff": cutoff} for gbuffer, cutoff in accuracy_values())
     changed = [{k: v for k, v in setting.items() if k in exact.params} for setting in settings]
     return [c for c in dict.fromkeys(exact.replaced(**change) for change in changed) if c != exact]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 
 from tuning.choose import Objective, is_timed, median_interval, time_interval_ms, time_ms
 from tuning.compiles import watch_compiles
+from tuning.features import main_work
 from tuning.measurement import Measurement
 from tuning.space import Space, default_space
 from tuning.sweep import Budget, Progress, SearchResult, search
@@ -22,11 +23,14 @@ from vtfs.device import versions
 from vtfs.files import write_atomically
 from vtfs.frame import FrameInputs
 from vtfs.image import exposure, heat_map, tone_map, write_png
-from vtfs.parameters import Configuration, configuration, is_exact
+from vtfs.input_error import InputError
+from vtfs.parameters import SHADOW_NAMES, SHADOW_REFERENCES, Configuration, configuration, is_exact
 from vtfs.scene_setup import SceneSetup
+from vtfs.shadow_maps import ShadowMaps
 
 DEFAULT_BUDGET = Budget(seconds=90.0)
 DEFAULT_CONFIGURATION = configuration("tiled_deferred")
+DEFAULT_SHADOWS = configuration("cluster_hierarchy")
 
 CLAIM = "for this JAX implementation on this device; nothing is rasterised: frame times start at view samples"
 
@@ -59,9 +63,11 @@ def tune(
     """
     started, compiles = time.perf_counter(), watch_compiles()
     tell("tracing view samples and counting the frames of the path")
-    frames = choose_frames(setup)
+    casts = casts_shadows(options.techniques)
+    frames = choose_frames(setup, DEFAULT_SHADOWS if casts else DEFAULT_CONFIGURATION)
+    samples = tuple(setup.samples(f) for f in frames)
     workload = SceneWorkload(
-        ScenePath(setup.key, frames, tuple(setup.samples(f) for f in frames), setup.lights, options.seed),
+        ScenePath(setup.key, frames, samples, setup.lights, options.seed, setup.shadow_scene if casts else None),
         compiles,
         options.objective,
     )
@@ -88,6 +94,7 @@ def tune(
         "schema": 1,
         "command": options.command,
         "claim": CLAIM,
+        "kind": "shadows" if casts else "lights",
         "scene": {
             "name": setup.name,
             "triangles": setup.n_triangles,
@@ -96,6 +103,7 @@ def tune(
             "key": setup.key,
             "viewport": [setup.cameras.viewport.width_px, setup.cameras.viewport.height_px],
             "measured_frames": list(frames),
+            **({"shadow_lights": workload.n_shadow_lights} if casts else {}),
         },
         "device": workload.device,
         "versions": versions(),
@@ -141,13 +149,33 @@ def tune(
     return result
 
 
-def choose_frames(setup: SceneSetup) -> tuple[int, ...]:
-    """The frames with the most, the median and the fewest lighting computations under the default
-    configuration, of at most 12 evenly spaced ones."""
+def casts_shadows(techniques: Sequence[str]) -> bool:
+    """Do the techniques cast shadows?
+
+    **Raises:** `InputError` where some do and others do not, and for references, which run on the host.
+    """
+    casting = [name for name in techniques if name in SHADOW_NAMES]
+    references = [name for name in casting if name in SHADOW_REFERENCES]
+    if references:
+        raise InputError(
+            f"--techniques {references[0]}: is what others are checked against and is not timed; leave it out."
+        )
+    if casting and len(casting) < len(techniques):
+        other = next(name for name in techniques if name not in casting)
+        raise InputError(
+            f"--techniques {casting[0]},{other}: one casts shadows, the other does not, so that their times cannot be "
+            "compared; tune one kind at a time."
+        )
+    return bool(casting)
+
+
+def choose_frames(setup: SceneSetup, config: Configuration = DEFAULT_CONFIGURATION) -> tuple[int, ...]:
+    """The frames with the most, the median and the least work under a configuration, of at most 12 evenly spaced
+    ones."""
     work = {}
     for frame in setup.counted_frames:
-        counts = cached_counts(DEFAULT_CONFIGURATION, setup.key, frame, functools.partial(_inputs, setup, frame))
-        work[frame] = counts.technique["lighting_computations"]
+        counts = cached_counts(config, setup.key, frame, functools.partial(_inputs, setup, frame))
+        work[frame] = main_work(counts.technique)
     return busiest_frames(work)
 
 
@@ -205,28 +233,35 @@ def _stages(found: SearchResult, objective: Objective) -> dict[str, dict[str, fl
 
 
 def _pictures(workload: SceneWorkload, found: SearchResult, folder: Path) -> list[dict[str, Any]]:
-    """The best configuration's image, and heat maps of lighting computations on one scale."""
+    """The best configuration's image, and heat maps of the work on one scale."""
     valid = workload.valid()
-    image = workload.image(_config(found.best))
+    best = _config(found.best)
+    image = workload.image(best)
     write_png(folder / "frame.png", tone_map(image, exposure(image, valid)))
-    frame = workload.frames[0]
+    frame, casts = workload.frames[0], best.technique in SHADOW_NAMES
+    unit = "triangles tested against a pixel's tile or cluster" if casts else "lighting computations per pixel"
     pictures: list[dict[str, Any]] = [
         {
             "file": "frame.png",
             "kind": "frame",
             "technique": found.best.technique,
-            "caption": f"Frame {frame}, the one with the most lighting computations, "
+            "caption": f"Frame {frame}, the one with the most {'tests' if casts else 'lighting computations'}, "
             f"as {found.best.technique} renders it.",
         }
     ]
-    fastest: dict[str, Measurement] = {}
-    for m in found.measurements:
-        if is_timed(m) and m.params.get("light_cutoff") == 0:
-            fastest[m.technique] = min(fastest.get(m.technique, m), m, key=lambda m: time_ms(m, "max"))
-    lengths = {technique: workload.list_lengths(_config(m)) for technique, m in fastest.items()}
-    listed = {technique: own for technique, own in lengths.items() if technique != "forward"}
-    largest = max((int(own.max(initial=0)) for own in (listed or lengths).values()), default=0)
-    for technique, own in lengths.items():
+    fastest: dict[str, Configuration] = {}
+    for m in sorted(filter(is_timed, found.measurements), key=lambda m: time_ms(m, "max")):
+        if m.params.get("light_cutoff") == 0:
+            fastest.setdefault(m.technique, _config(m))
+    if casts:
+        maps = {technique: workload.shadow_maps(config) for technique, config in fastest.items()}
+        pictures.append(_shadow_picture(folder, best, maps[best.technique]))
+        work = {technique: own.tests for technique, own in maps.items()}
+    else:
+        work = {technique: workload.list_lengths(config) for technique, config in fastest.items()}
+    scaled = {technique: own for technique, own in work.items() if technique != "forward"} or work
+    largest = max((int(own.max(initial=0)) for own in scaled.values()), default=0)
+    for technique, own in work.items():
         name = f"heat_{technique}.png"
         write_png(folder / name, heat_map(own, largest, valid))
         pictures.append(
@@ -234,10 +269,25 @@ def _pictures(workload: SceneWorkload, found: SearchResult, folder: Path) -> lis
                 "file": name,
                 "kind": "heat_map",
                 "technique": technique,
-                "caption": f"Lighting computations per pixel, {_config(fastest[technique])}.",
+                "caption": f"{unit[0].upper()}{unit[1:]}, {fastest[technique]}.",
+                "unit": unit,
                 "max_count": int(own.max(initial=0)),
                 "mean_count": float(own[valid].mean()) if valid.any() else 0.0,
                 "scale_max": largest,
             }
         )
     return pictures
+
+
+def _shadow_picture(folder: Path, best: Configuration, maps: ShadowMaps) -> dict[str, Any]:
+    """What share of the lights that would light it each pixel lies in the shadow of."""
+    lit = maps.lit > 0
+    share = np.where(lit, maps.shadowed / np.maximum(maps.lit, 1), 0)
+    write_png(folder / "shadows.png", heat_map((1000 * (1 - share)).astype(np.int64), 1000, lit))
+    return {
+        "file": "shadows.png",
+        "kind": "shadows",
+        "technique": best.technique,
+        "caption": f"Shadows that {best.technique} found: dark in the shadow of all lights that cast and would light "
+        f"the pixel, bright in that of none; {maps.shadowed.sum() / max(int(maps.lit.sum()), 1):.1%} in shadow.",
+    }
