@@ -139,6 +139,7 @@ def tune(
         },
         "stages": _stages(found, options.objective),
         "pictures": pictures,
+        **({"heat_scale": {"scale": "log"}} if casts else {}),
     }
     result |= {
         "compiled_programs": compiles.programs,
@@ -251,7 +252,7 @@ def _pictures(workload: SceneWorkload, found: SearchResult, folder: Path) -> lis
     ]
     fastest: dict[str, Configuration] = {}
     for m in sorted(filter(is_timed, found.measurements), key=lambda m: time_ms(m, "max")):
-        if m.params.get("light_cutoff") == 0:
+        if is_exact(_config(m)):
             fastest.setdefault(m.technique, _config(m))
     if casts:
         maps = {technique: workload.shadow_maps(config) for technique, config in fastest.items()}
@@ -263,7 +264,9 @@ def _pictures(workload: SceneWorkload, found: SearchResult, folder: Path) -> lis
     largest = max((int(own.max(initial=0)) for own in scaled.values()), default=0)
     for technique, own in work.items():
         name = f"heat_{technique}.png"
-        write_png(folder / name, heat_map(own, largest, valid))
+        # A volume may cross a thousand tiles, or one: only logarithms show both.
+        shown, top = (_log(own), int(_log(np.array(largest)))) if casts else (own, largest)
+        write_png(folder / name, heat_map(shown, top, valid))
         pictures.append(
             {
                 "file": name,
@@ -277,6 +280,11 @@ def _pictures(workload: SceneWorkload, found: SearchResult, folder: Path) -> lis
             }
         )
     return pictures
+
+
+def _log(counts: np.ndarray) -> np.ndarray:
+    """Thousandths of log(1 + count), whole."""
+    return np.round(1000 * np.log1p(counts)).astype(np.int64)
 
 
 def _shadow_picture(folder: Path, best: Configuration, maps: ShadowMaps) -> dict[str, Any]:
