@@ -178,7 +178,7 @@ def time_stages(lights: Sphere) -> Times:
 
 def view_benchmark(counts: list[int], only: str, full: bool) -> None:
     camera = Camera((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 60.0, NEAR_M, FAR_M, VIEWPORT)
-    positions, grid = surface_positions(camera), cluster_grid(camera, TILE_PX, 0, FAR_M)
+    positions, grid = surface_positions(camera), jax.device_put(cluster_grid(camera, TILE_PX, 0, FAR_M))
     form = jax.jit(lambda p, g: form_clusters(p, g, "implicit", CELLS, CLUSTERS))
     clusters = form(positions, grid)
     assert not bool(clusters.overflowed)

@@ -58,7 +58,7 @@ def main() -> None:
             )
             at = counts.at_batch(batch)
             stages = {}
-            for stage in REGISTRY[technique].stages_of(inputs.has_transparent):
+            for stage in REGISTRY[technique].stages_of(planned(config, sizes), inputs.has_transparent):
                 own = stage_program(stage, stage.narrowed(planned(config, sizes)))
                 stages[stage.name] = median_ms(
                     lambda own=own, stage=stage, env=env: own(*(env[n] for n in stage.needs))

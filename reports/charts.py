@@ -20,7 +20,7 @@ from reports.chart_style import (
     time_axis,
     timed_text,
 )
-from reports.palette import INK, QUIET_INK, in_stage_order, stage_colour
+from reports.palette import INK, QUIET_INK, in_stage_order, stage_colour, technique_colour
 from reports.run_folder import RunFolder, Timed
 
 _BEYOND = 8.0  # times the fastest technique
@@ -167,6 +167,33 @@ def stage_times(run: RunFolder) -> go.Figure | None:
     figure.update_xaxes(title={"text": "ms, median on the slowest frame"}, range=[0, 1.14 * longest_ms])
     figure.update_yaxes(autorange="reversed", showgrid=False, showdividers=False, ticks="", showline=False)
     return styled(figure, height_px=136 + 84 * len(techniques))
+
+
+def list_lengths(run: RunFolder) -> go.Figure | None:
+    """How many lists have how many lights: one line a technique, stepped at the edges of its bins."""
+    histograms = {own.technique: own for own in run.list_lengths if own.n_lists}
+    if not histograms:
+        return None
+    figure = go.Figure()
+    for technique in in_technique_order(histograms):
+        own = histograms[technique]
+        edges = [i * own.bin_width for i in range(len(own.lists_in_bin) + 1)]
+        shares = [100 * n / own.n_lists for n in own.lists_in_bin]
+        figure.add_scatter(
+            x=edges,
+            y=[*shares, 0.0],
+            mode="lines",
+            name=plain(technique),
+            line={"color": technique_colour(technique), "width": 2, "shape": "hv"},
+            hovertext=[
+                f"<b>{plain(technique)}</b><br>{first:g} to {first + own.bin_width - 1:g} lights: {n:,.0f} lists"
+                for first, n in zip(edges, (*own.lists_in_bin, 0), strict=True)
+            ],
+            hoverinfo="text",
+        )
+    figure.update_xaxes(title={"text": "lights on the list of a cell"}, rangemode="tozero")
+    figure.update_yaxes(title={"text": "lists, %"}, rangemode="tozero")
+    return styled(figure, height_px=320)
 
 
 def beyond_the_chart(run: RunFolder) -> dict[str, float]:

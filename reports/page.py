@@ -11,7 +11,7 @@ from plotly.offline import get_plotlyjs
 
 from reports import number_text
 from reports.chart_style import chart_html
-from reports.charts import beyond_the_chart, speed_against_error, stage_times
+from reports.charts import beyond_the_chart, list_lengths, speed_against_error, stage_times
 from reports.model_charts import predicted_against_measured, time_along_parameters
 from reports.palette import in_stage_order, technique_colour
 from reports.pictures import heat_scale, read_pictures
@@ -25,6 +25,7 @@ _CHARTS = {
     "stage-times": stage_times,
     "predicted-against-measured": predicted_against_measured,
     "time-along-parameters": time_along_parameters,
+    "list-lengths": list_lengths,
 }
 
 

@@ -14,6 +14,13 @@ from vtfs.input_error import InputError
 # The ramp of `vtfs.image.heat_map`, for where `result.json` does not bring its own.
 HEAT_COLOURS = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")
 
+_SHOWS = {
+    "clusters": "The cells that samples lie in.",
+    "slices": "The depth slice of each sample.",
+    "false_positives": "Lights listed for a sample that do not reach it.",
+    "shadows": "The shadows that were found.",
+}
+
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
@@ -38,7 +45,7 @@ class Picture:
     def alternative(self) -> str:
         """What a reader who does not see the picture needs to know."""
         if self.kind != "heat_map":
-            return f"{'Shadows' if self.kind == 'shadows' else 'The rendered frame'}. {self.caption}".strip()
+            return f"{_SHOWS.get(self.kind, 'The rendered frame.')} {self.caption}".strip()
         numbers = [
             f"{label} {value:g}"
             for label, value in (("mean", self.mean_count), ("most", self.max_count))
@@ -62,12 +69,12 @@ class HeatScale:
 
 
 def read_pictures(folder: Path, listed: list[dict[str, Any]]) -> tuple[Picture, ...]:
-    """The pictures that `result.json` lists, the rendered frame first.
+    """The pictures that `result.json` lists: the rendered frame, heat maps, then cells.
 
     **Raises:** `InputError` for a missing or truncated PNG, or a name that leaves the folder.
     """
     pictures = [_picture(folder, item) for item in listed]
-    return tuple(sorted(pictures, key=lambda picture: picture.kind == "heat_map"))
+    return tuple(sorted(pictures, key=lambda picture: (picture.kind in _SHOWS, picture.kind == "heat_map")))
 
 
 def heat_scale(pictures: tuple[Picture, ...], given: dict[str, Any]) -> HeatScale | None:

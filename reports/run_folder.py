@@ -99,6 +99,26 @@ class StageModel:
 
 
 @dataclass(frozen=True)
+class ListHistogram:
+    """How long the light lists of a technique's cells are.
+
+    - `lists_in_bin`: bin `i` has those of `i * bin_width` to `(i + 1) * bin_width - 1` lights.
+    - `dropped_at_cap`: entries lost where an engine keeps so many lights a cell.
+    """
+
+    technique: str
+    bin_width: float
+    lists_in_bin: tuple[float, ...]
+    n_entries: float
+    longest: float
+    dropped_at_cap: dict[str, float]
+
+    @property
+    def n_lists(self) -> float:
+        return sum(self.lists_in_bin)
+
+
+@dataclass(frozen=True)
 class Scene:
     """What was rendered. None, or empty, where `result.json` does not say.
 
@@ -136,6 +156,7 @@ class RunFolder:
     predictions: tuple[Prediction, ...]
     counts: dict[str, dict[str, float]]
     stages_ms: dict[str, dict[str, float]]
+    list_lengths: tuple[ListHistogram, ...]
     measurements: tuple[Measurement, ...]
 
     @property
@@ -197,6 +218,7 @@ def read_run_folder(folder: Path | str) -> RunFolder:
         predictions=tuple(made for item, at in _records(result, "predictions") if (made := _prediction(item, at))),
         counts=_table(result, "counts"),
         stages_ms=_table(result, "stages"),
+        list_lengths=tuple(_list_histogram(item, at) for item, at in _records(result, "list_lengths")),
         measurements=tuple(read_measurements(folder / "measurements.jsonl")),
     )
 
@@ -292,6 +314,17 @@ def _stage_model(item: dict[str, Any], at: str) -> StageModel:
         loo_error=_number(item, "loo_error", at),
         constant_loo_error=_number(item, "constant_loo_error", at),
         n_runs=None if n_runs is None else int(n_runs),
+    )
+
+
+def _list_histogram(item: dict[str, Any], at: str) -> ListHistogram:
+    return ListHistogram(
+        technique=_text(item, "technique", at),
+        bin_width=_number(item, "bin_width", at) or 1.0,
+        lists_in_bin=_list_of_numbers(item, "lists_in_bin", at),
+        n_entries=_number(item, "entries", at) or 0.0,
+        longest=_number(item, "longest", at) or 0.0,
+        dropped_at_cap=_numbers(_record(item, "dropped_at_cap", at), f"{at}.dropped_at_cap"),
     )
 
 

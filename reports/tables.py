@@ -21,6 +21,8 @@ COUNT_MEANINGS = {
     "tree_tests": "tests of nodes of the light tree",
     "leaf_tests": "tests of single lights",
     "lighting_computations": "one light evaluated for one sample",
+    "approximated_pairs": "entries evaluated once for a cell",
+    "lighting_computations_saved": "what that spared",
     "lighting_computations_tile_area": "the same as tile area times list length (2011 paper)",
     "shadow_lights": "lights that cast shadows",
     "shadow_samples": "samples that they would light",
@@ -103,15 +105,15 @@ def count_rows(run: RunFolder) -> tuple[CountRow, ...]:
     """One row a count that any technique has; known ones first, in the order of the work."""
     known = list(COUNT_MEANINGS)
 
-    def place(name: str) -> tuple[int, str]:
-        stem = name.split()[0]
-        return (known.index(stem) if stem in known else len(known), "")
+    def stem(name: str) -> str:
+        return "dropped_at_cap" if name.startswith("dropped_at_cap") else name.split()[0]
+
+    def place(name: str) -> int:
+        return known.index(stem(name)) if stem(name) in known else len(known)
 
     found = dict.fromkeys(name for counts in run.counts.values() for name in counts)
     return tuple(
-        CountRow(
-            name, COUNT_MEANINGS.get(name.split()[0], ""), tuple(counts.get(name) for counts in run.counts.values())
-        )
+        CountRow(name, COUNT_MEANINGS.get(stem(name), ""), tuple(counts.get(name) for counts in run.counts.values()))
         for name in sorted(found, key=place)
     )
 

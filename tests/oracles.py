@@ -66,6 +66,8 @@ def image(
     rotation = samples.camera.view_from_world[:3, :3]
     with np.errstate(invalid="ignore", divide="ignore"):
         to_eye = -position_m / np.linalg.norm(position_m, axis=-1, keepdims=True)
+        if samples.camera.is_orthographic:
+            to_eye = np.broadcast_to([0.0, 0.0, 1.0], position_m.shape)
         for n, light_m in enumerate(in_view_space(samples.camera, lights.position_m)):
             to_light = light_m - position_m
             distance = np.linalg.norm(to_light, axis=-1)

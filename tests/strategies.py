@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from tests import oracles
-from vtfs.camera import Camera, Viewport
+from vtfs.camera import Camera, Lens, Viewport
 from vtfs.gbuffer import Fragments, GBuffer, Positions
 from vtfs.layers import Layers, TransparentLayer
 from vtfs.lights import Lights
@@ -69,6 +69,16 @@ def samples_at(camera: Camera, depth_m: np.ndarray, valid: np.ndarray, rng: np.r
         np.where(valid, 0, -1).astype(np.int32),
         valid,
     )
+
+
+def through(samples: ViewSamples, lens: Lens) -> ViewSamples:
+    """The same depths seen through another lens."""
+    camera = replace(samples.camera, lens=lens)
+    slope = np.stack(np.meshgrid(*camera.pixel_slopes()), axis=-1)
+    width = 1.0 if camera.is_orthographic else -samples.position_m[..., 2:].astype(np.float64)
+    position_m = samples.position_m.copy()
+    position_m[..., :2] = np.where(samples.valid[..., None], slope * width, 0)
+    return replace(samples, camera=camera, position_m=position_m)
 
 
 def random_samples(camera: Camera, seed: int, valid_share: float = 0.8) -> ViewSamples:

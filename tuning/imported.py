@@ -58,11 +58,11 @@ def tune_imported(
     """
     started = time.perf_counter()
     measurements = {c: _measurement(imported, c, seed) for c in imported.repeats_ms}
-    exact = [c for c in measurements if _is_exact(c)]
+    exact = [c for c in measurements if c.is_exact]
     if not exact:
         raise InputError(
-            f"{imported.source}: only settings that change the image were timed; time one with gbuffer float32 and "
-            "light_cutoff 0."
+            f"{imported.source}: only settings that change the image were timed; time one with gbuffer float32, "
+            "light_cutoff 0 and approximate 0."
         )
     model = fit_groups(_table(imported), seed)
     predicted = _predicted(imported, model, objective)
@@ -136,7 +136,7 @@ def _table(imported: ImportedTimes) -> TimingTable:
 
     Settings that change the image change what an operation costs: they are not fitted, nor predicted.
     """
-    rows = [(c, i) for c in imported.repeats_ms if _is_exact(c) for i in range(len(imported.frames))]
+    rows = [(c, i) for c in imported.repeats_ms if c.is_exact for i in range(len(imported.frames))]
     columns = _features(imported, rows)
     return TimingTable(
         columns, {"technique": tuple(c.technique for c, _ in rows)}, tuple(imported.repeats_ms[c][i] for c, i in rows)
@@ -155,8 +155,8 @@ def _features(imported: ImportedTimes, rows: Sequence[tuple[Configuration, int]]
 
 def _predicted(imported: ImportedTimes, model: TableModel, objective: Objective) -> dict[Configuration, Estimate]:
     """Of every exact configuration of a technique that was timed."""
-    known = {c.technique for c in imported.repeats_ms if _is_exact(c)}
-    configs = [c for c in imported.counts if c.technique in known and _is_exact(c)]
+    known = {c.technique for c in imported.repeats_ms if c.is_exact}
+    configs = [c for c in imported.counts if c.technique in known and c.is_exact]
     rows = [(c, i) for c in configs for i in range(len(imported.frames))]
     labels = {"technique": tuple(c.technique for c, _ in rows)}
     table = TimingTable(_features(imported, rows), labels, ((math.nan,),) * len(rows))
@@ -273,13 +273,6 @@ def _entry(config: Configuration, ms: float, interval_ms: tuple[float, float] | 
         "time_ms_interval": None if interval_ms is None else list(map(_finite, interval_ms)),
         "error": None,
     }
-
-
-def _is_exact(config: Configuration) -> bool:
-    return all(config.params.get(name, PARAMETERS[name].default) == PARAMETERS[name].default for name in _CHANGE_IMAGE)
-
-
-_CHANGE_IMAGE = ("gbuffer", "light_cutoff")
 
 
 def _lights(imported: ImportedTimes) -> float | None:

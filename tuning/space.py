@@ -95,16 +95,20 @@ def default_space(techniques: Iterable[str], n_samples: int) -> Space:
     return Space(names, values)
 
 
-def accuracy_values() -> tuple[tuple[str, float], ...]:
-    """`(gbuffer, light_cutoff)` pairs that trade accuracy for speed, the most telling first.
+def accuracy_values() -> tuple[dict[str, Value], ...]:
+    """Settings that trade accuracy for speed, the most telling first.
 
     They are tried at the best exact configuration, for the chart of speed against error.
     """
     return (
-        ("float32", 0.01),
-        ("float16", 0.0),
-        ("float32", 0.1),
-        ("bfloat16", 0.0),
+        {"front_faces": "culled"},
+        {"stencil": "wrap"},
+        {"light_cutoff": 0.01},
+        {"gbuffer": "float16"},
+        {"approximate": 0.01},
+        {"light_cutoff": 0.1},
+        {"gbuffer": "bfloat16"},
+        {"approximate": 0.1},
     )
 
 

@@ -26,13 +26,16 @@ from tuning.record import append_measurement, read_measurements
 from tuning.select import fit_models, fit_stage
 from tuning.space import Space, accuracy_values
 from vtfs.input_error import InputError
-from vtfs.parameters import SHADOW_NAMES, Configuration, Value, configuration, exact_configuration, is_exact
+from vtfs.parameters import SHADOW_NAMES, Configuration, configuration
 
 HOPELESS = 12
 """A technique whose default needs this many times the lighting computations of the thriftiest is not measured."""
 
 TOO_SLOW = 4
 """A technique whose default takes this many times as long as the fastest one's is measured at its default only."""
+
+PATIENCE = 6
+"""So many choices in a row that gained nothing end the search: no model is sure of that on a noisy machine."""
 
 _ACCURACY_SHARE = 0.2  # of the budget, kept for the chart of speed against error
 
@@ -177,6 +180,9 @@ def search(
     in_budget = in_budget and all(run.measure(c, share) for c in spread if c.technique in explored.techniques)
     stop_reason = f"the budget of {budget} was used"
     while in_budget:
+        if run.fruitless(explored, design) >= PATIENCE:
+            stop_reason = f"the last {PATIENCE} choices gained nothing"
+            break
         models = run.frame_models(explored)
         choice = choose_next(explored, run.measured, run.counts, models, objective)
         if choice.stop_reason is not None:
@@ -184,7 +190,7 @@ def search(
             break
         in_budget = all(run.measure(candidate, share) for candidate in choice.configurations)
 
-    exact = run.fastest(candidate for candidate in run.measured if candidate in hopeful and is_exact(candidate))
+    exact = run.fastest(candidate for candidate in run.measured if candidate in hopeful and candidate.is_exact)
     if exact is not None:
         for candidate in _less_accurate(exact):
             if not run.measure(candidate):
@@ -291,9 +297,9 @@ class _Run:
     def _is_allowed(self, candidate: Configuration) -> bool:
         """May it be recommended? What may not, as a default that the space leaves out, is not there to be beaten."""
         if self._max_error is None:
-            return candidate in self._space and is_exact(candidate)
+            return candidate in self._space and candidate.is_exact
         error = self.measured[candidate].error
-        known = candidate in self._space or exact_configuration(candidate) in self._space
+        known = candidate in self._space or candidate.exact() in self._space
         return known and error is not None and error <= self._max_error
 
     def timed(self, candidate: Configuration) -> Measurement | None:
@@ -304,13 +310,17 @@ class _Run:
         times = {c: time_ms(m, self.objective) for c in candidates if (m := self.timed(c)) is not None}
         return min(times, key=times.__getitem__, default=None)
 
+    def fruitless(self, space: Space, design: Collection[Configuration]) -> int:
+        """How many choices of the search were measured since the fastest configuration was. By the record's order, so
+        that a run that goes on stops where one run would have."""
+        fastest = self.fastest(c for c in self.measured if c in space and c.is_exact)
+        since = list(self.measured)
+        since = since[since.index(fastest) + 1 :] if fastest is not None else since
+        return sum(c in space and c.is_exact and c not in design for c in since)
+
     def best(self, space: Space, max_error: float | None) -> Configuration:
         """The fastest that may be recommended."""
-        timed = {
-            c: m
-            for c in self.measured
-            if (c in space or exact_configuration(c) in space) and (m := self.timed(c)) is not None
-        }
+        timed = {c: m for c in self.measured if (c in space or c.exact() in space) and (m := self.timed(c)) is not None}
         if not timed:
             outcomes = ", ".join(sorted({measurement.outcome for measurement in self.measured.values()}))
             message = next((f": {m.message}" for m in self.measured.values() if m.message), "")
@@ -319,7 +329,7 @@ class _Run:
                 "try a smaller size, a larger budget, other techniques or another space."
             )
         if max_error is None:
-            found = self.fastest(filter(is_exact, timed))
+            found = self.fastest(c for c in timed if c.is_exact)
             if found is None:
                 raise InputError("max-error is missing and no exact setting could be timed; say what error is allowed.")
             return found
@@ -391,9 +401,7 @@ def _explored(space: Space, run: _Run) -> tuple[Space, dict[str, str]]:
 
 
 def _less_accurate(exact: Configuration) -> list[Configuration]:
-    settings: list[dict[str, Value]] = [{"front_faces": "culled"}, {"stencil": "wrap"}]
-    settings += ({"gbuffer": gbuffer, "light_cutoff": cutoff} for gbuffer, cutoff in accuracy_values())
-    changed = [{k: v for k, v in setting.items() if k in exact.params} for setting in settings]
+    changed = [{k: v for k, v in setting.items() if k in exact.params} for setting in accuracy_values()]
     return [c for c in dict.fromkeys(exact.replaced(**change) for change in changed) if c != exact]
 
 

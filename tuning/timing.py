@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -26,18 +27,29 @@ def timed_ms(run: Callable[[], object]) -> float:
 
 
 def repeats_ms(
-    run: Callable[[], object], decided: Callable[[tuple[float, float]], bool], cap_s: float = CAP_S
+    run: Callable[[], object],
+    decided: Callable[[tuple[float, float]], bool],
+    cap_s: float = CAP_S,
+    hopeless_ms: float = math.inf,
 ) -> tuple[float, ...]:
     """Times of at least three runs. The caller has made one before, which compiled and warmed up.
 
     More are made until the 95 % interval of the median is within 2 %, or `cap_s` is spent, or the interval
     already decides what the caller wants to know (a configuration that has lost needs no third digit).
+
+    **Arguments:**
+
+    - `hopeless_ms`: where all runs are slower than this there may be fewer than three, even one, if they fill `MIN_S`.
     """
     times: list[float] = []
     started = time.perf_counter()
     while True:
         times.append(timed_ms(run))
-        if len(times) < MIN_REPEATS or time.perf_counter() - started < min(MIN_S, cap_s):
+        if time.perf_counter() - started < min(MIN_S, cap_s):
+            continue
+        if min(times) > hopeless_ms:
+            return tuple(times)
+        if len(times) < MIN_REPEATS:
             continue
         low, high = median_interval(times)
         middle = (low + high) / 2

@@ -16,17 +16,16 @@ from tuning.choose import Objective, is_timed, median_interval, time_interval_ms
 from tuning.compiles import watch_compiles
 from tuning.features import main_work
 from tuning.measurement import Measurement
+from tuning.run_pictures import draw
 from tuning.space import Space, default_space
 from tuning.sweep import Budget, Progress, SearchResult, search
 from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_counts
 from vtfs.device import versions
 from vtfs.files import write_atomically
 from vtfs.frame import FrameInputs
-from vtfs.image import exposure, heat_map, tone_map, write_png
 from vtfs.input_error import InputError
-from vtfs.parameters import SHADOW_NAMES, SHADOW_REFERENCES, Configuration, configuration, is_exact
+from vtfs.parameters import SHADOW_NAMES, SHADOW_REFERENCES, Configuration, configuration
 from vtfs.scene_setup import SceneSetup
-from vtfs.shadow_maps import ShadowMaps
 
 DEFAULT_BUDGET = Budget(seconds=90.0)
 DEFAULT_CONFIGURATION = configuration("tiled_deferred")
@@ -88,7 +87,7 @@ def tune(
     tell("comparing the best with the defaults, in turns")
     gain, times = _duel(workload, found, options.objective)
     tell("drawing")
-    pictures = _pictures(workload, found, options.out / "pictures")
+    drawn = draw(workload, found, options.out / "pictures")
     compared = [m for m in found.measurements if is_timed(m)]
     result = {
         "schema": 1,
@@ -138,8 +137,7 @@ def tune(
             name: dict(counts[0]) for name in space.techniques if (counts := workload.counts(configuration(name)))
         },
         "stages": _stages(found, options.objective),
-        "pictures": pictures,
-        **({"heat_scale": {"scale": "log"}} if casts else {}),
+        **drawn.as_json(),
     }
     result |= {
         "compiled_programs": compiles.programs,
@@ -226,76 +224,8 @@ def _stages(found: SearchResult, objective: Objective) -> dict[str, dict[str, fl
     stages: dict[str, dict[str, float]] = {}
     fastest: dict[str, Measurement] = {}
     for m in found.measurements:
-        if is_timed(m) and is_exact(_config(m)):
+        if is_timed(m) and _config(m).is_exact:
             fastest[m.technique] = min(fastest.get(m.technique, m), m, key=lambda m: time_ms(m, objective))
     for technique, m in fastest.items():
         stages[technique] = {name: float(np.median(frames[0])) for name, frames in m.stages_ms.items()}
     return stages
-
-
-def _pictures(workload: SceneWorkload, found: SearchResult, folder: Path) -> list[dict[str, Any]]:
-    """The best configuration's image, and heat maps of the work on one scale."""
-    valid = workload.valid()
-    best = _config(found.best)
-    image = workload.image(best)
-    write_png(folder / "frame.png", tone_map(image, exposure(image, valid)))
-    frame, casts = workload.frames[0], best.technique in SHADOW_NAMES
-    unit = "triangles tested against a pixel's tile or cluster" if casts else "lighting computations per pixel"
-    pictures: list[dict[str, Any]] = [
-        {
-            "file": "frame.png",
-            "kind": "frame",
-            "technique": found.best.technique,
-            "caption": f"Frame {frame}, the one with the most {'tests' if casts else 'lighting computations'}, "
-            f"as {found.best.technique} renders it.",
-        }
-    ]
-    fastest: dict[str, Configuration] = {}
-    for m in sorted(filter(is_timed, found.measurements), key=lambda m: time_ms(m, "max")):
-        if is_exact(_config(m)):
-            fastest.setdefault(m.technique, _config(m))
-    if casts:
-        maps = {technique: workload.shadow_maps(config) for technique, config in fastest.items()}
-        pictures.append(_shadow_picture(folder, best, maps[best.technique]))
-        work = {technique: own.tests for technique, own in maps.items()}
-    else:
-        work = {technique: workload.list_lengths(config) for technique, config in fastest.items()}
-    scaled = {technique: own for technique, own in work.items() if technique != "forward"} or work
-    largest = max((int(own.max(initial=0)) for own in scaled.values()), default=0)
-    for technique, own in work.items():
-        name = f"heat_{technique}.png"
-        # A volume may cross a thousand tiles, or one: only logarithms show both.
-        shown, top = (_log(own), int(_log(np.array(largest)))) if casts else (own, largest)
-        write_png(folder / name, heat_map(shown, top, valid))
-        pictures.append(
-            {
-                "file": name,
-                "kind": "heat_map",
-                "technique": technique,
-                "caption": f"{unit[0].upper()}{unit[1:]}, {fastest[technique]}.",
-                "unit": unit,
-                "max_count": int(own.max(initial=0)),
-                "mean_count": float(own[valid].mean()) if valid.any() else 0.0,
-                "scale_max": largest,
-            }
-        )
-    return pictures
-
-
-def _log(counts: np.ndarray) -> np.ndarray:
-    """Thousandths of log(1 + count), whole."""
-    return np.round(1000 * np.log1p(counts)).astype(np.int64)
-
-
-def _shadow_picture(folder: Path, best: Configuration, maps: ShadowMaps) -> dict[str, Any]:
-    """What share of the lights that would light it each pixel lies in the shadow of."""
-    lit = maps.lit > 0
-    share = np.where(lit, maps.shadowed / np.maximum(maps.lit, 1), 0)
-    write_png(folder / "shadows.png", heat_map((1000 * (1 - share)).astype(np.int64), 1000, lit))
-    return {
-        "file": "shadows.png",
-        "kind": "shadows",
-        "technique": best.technique,
-        "caption": f"Shadows that {best.technique} found: dark in the shadow of all lights that cast and would light "
-        f"the pixel, bright in that of none; {maps.shadowed.sum() / max(int(maps.lit.sum()), 1):.1%} in shadow.",
-    }

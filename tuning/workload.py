@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ from tuning.measurement import Measurement, Outcome
 from tuning.shadow_check import MaskCheck, ShadowChecker, masks_on_host
 from tuning.timing import interleaved_ms, repeats_ms, timed_ms
 from vtfs.cache import cached
+from vtfs.cell_maps import CellMaps, cell_maps
 from vtfs.device import device_name, versions
 from vtfs.frame import (
     NO_SIZES,
@@ -37,8 +39,8 @@ from vtfs.frame import (
 )
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
-from vtfs.op_counts import OpCounts
-from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration, is_exact
+from vtfs.op_counts import ListLengths, OpCounts
+from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration
 from vtfs.reference import forward_reference, image_error
 from vtfs.shadow_inputs import ShadowScene
 from vtfs.shadow_maps import ShadowMaps, shadow_maps
@@ -53,6 +55,9 @@ the rounding of its position (1e-7 of its distance to the eye) counts against it
 
 LOST = 1.1
 """A configuration this many times as slow as the best so far has lost: its time needs no more repeats."""
+
+HOPELESS = 1.6
+"""Where one run took this many times as long as the best so far, no other is made: a busy machine explains less."""
 
 TIMEOUT_S = 30.0
 """A frame that takes longer is recorded as `timeout`, not repeated."""
@@ -82,7 +87,10 @@ class SceneWorkload:
         self._path = path
         self._compiles = compiles
         self._objective = objective
-        self._inputs = [FrameInputs(samples, path.lights, path.shadow_scene) for samples in path.samples]
+        self._inputs = [
+            FrameInputs(samples, path.lights, frame, shadow_scene=path.shadow_scene)
+            for samples, frame in zip(path.samples, path.frames, strict=True)
+        ]
         self._reference: np.ndarray | None = None
         self._checker: ShadowChecker | None = None
         self._counted: dict[tuple[Configuration, int], FrameCounts] = {}
@@ -154,9 +162,17 @@ class SceneWorkload:
         """Which pixels of that frame have a sample."""
         return self._inputs[0].seen()
 
-    def list_lengths(self, config: Configuration) -> np.ndarray:
-        """Lights listed for each pixel of that frame."""
-        return count(config, self._inputs[0])[1].of_sample
+    def solid(self) -> np.ndarray:
+        """Which of them have a solid one."""
+        return self._inputs[0].samples.valid
+
+    def list_lengths(self, config: Configuration) -> ListLengths:
+        """Lights listed for each pixel and each cell of that frame."""
+        return count(config, self._inputs[0])[1]
+
+    def cell_maps(self, config: Configuration) -> CellMaps | None:
+        """The cells of that frame; None where the technique has none."""
+        return cell_maps(config, self._inputs[0])
 
     def shadow_maps(self, config: Configuration) -> ShadowMaps:
         """Shadows and tests on that frame."""
@@ -202,33 +218,30 @@ class SceneWorkload:
             reference = self.reference()
         with np.errstate(invalid="ignore", over="ignore"):  # of an image that overflowed the error is infinite
             taken.error, taken.error_p999 = image_error(image_on_host(image, self._inputs[0]), reference, valid)
-        if is_exact(config) and not taken.error <= EXACT_ERROR:
+        if config.is_exact and not taken.error <= EXACT_ERROR:
             return "failed", f"error {taken.error:.2g} against the float64 reference; float32 explains {EXACT_ERROR:g}"
         # The first run's time may be the compiler's: only a second one is held against the configuration.
         slow = time.perf_counter() - started > TIMEOUT_S
         if slow and (seconds := timed_ms(self._frame_run(config, 0)) / 1e3) > TIMEOUT_S:
             return "timeout", f"one frame took {seconds:.0f} s, more than {TIMEOUT_S:.0f} s"
 
+        # With `mean` every frame counts; with `max` only the slowest one, and there is a time to beat.
+        only_slowest = self._objective == "max"
+        beat_ms = best_ms if best_ms is not None and only_slowest else math.inf
         frames: list[tuple[float, ...]] = []
         slowest_low = 0.0
         for i in range(len(self._inputs)):
-            if (
-                frames
-                and best_ms is not None
-                and self._objective == "max"
-                and median_interval(frames[0])[0] > LOST * best_ms
-            ):
+            if frames and median_interval(frames[0])[0] > LOST * beat_ms:
                 frames.append(())  # it lost on the first frame: the others cannot make it faster
                 continue
 
             def decided(interval_ms: tuple[float, float], slowest_low: float = slowest_low) -> bool:
-                lost = best_ms is not None and interval_ms[0] > LOST * best_ms
-                # With `mean` every frame counts; with `max` only the slowest one.
-                return self._objective == "max" and (lost or interval_ms[1] < slowest_low)
+                return only_slowest and (interval_ms[0] > LOST * beat_ms or interval_ms[1] < slowest_low)
 
-            frames.append(repeats_ms(self._frame_run(config, i), decided))
+            frames.append(repeats_ms(self._frame_run(config, i), decided, hopeless_ms=HOPELESS * beat_ms))
             slowest_low = max(slowest_low, min(frames[-1]))
-        if all(frames) and is_listed(config):
+        # Models of stages are fitted to exact settings.
+        if all(frames) and is_listed(config) and config.is_exact:
             env = env or run_stages(config, self._inputs[0], sizes)[0]
         taken.stages_ms = self._stages_ms(config, sizes, env) | {"frame": tuple(frames)}
         return "timed", ""
@@ -248,7 +261,8 @@ class SceneWorkload:
 
         None where `env` is empty: of what has lost, and where the frame is one stage.
         """
-        stages = REGISTRY[config.technique].stages_of(self._inputs[0].has_transparent) if env else ()
+        technique = REGISTRY[config.technique]
+        stages = technique.stages_of(technique.plan(config), self._inputs[0].has_transparent) if env else ()
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:

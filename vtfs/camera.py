@@ -172,23 +172,23 @@ class Camera:
         y = (1 - 2 * (np.arange(height) + 0.5) / height + 2 * self.lens.shift_y) * self.tan_half_y
         return x, y
 
-    def primary_directions(self) -> np.ndarray:
-        """World-space directions through pixel centres, float64 `[h, w, 3]`, of a perspective view.
+    def width_at(self, depth_m: np.ndarray) -> np.ndarray:
+        """By what slopes are multiplied to give x and y at a depth: the depth, or 1 in a parallel projection."""
+        return np.ones_like(depth_m) if self.is_orthographic else depth_m
 
-        Their depth in view space is 1, so that the parameter along such a ray is depth, not distance.
+    def primary_rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """World-space origins and directions of the rays through pixel centres, float64 `[h, w, 3]` each.
+
+        Their depth in view space is 1, so that the parameter along such a ray is depth, not distance. They start at the
+        eye; in a parallel projection beside it, and all have one direction.
         """
-        self.require_perspective("primary rays")
         x, y = self.pixel_slopes()
         right, up, backward = self.view_from_world[:3, :3]
-        return x[None, :, None] * right + y[:, None, None] * up - backward
-
-    def require_perspective(self, what: str) -> None:
-        """**Raises:** `InputError` that says `what` parallel projections do not have."""
+        aside = x[None, :, None] * right + y[:, None, None] * up
+        eye_m = np.asarray(self.eye_m, np.float64)
         if self.is_orthographic:
-            raise InputError(
-                f"camera `orthographic_height_m` = {self.lens.orthographic_height_m:g}: {what} need a perspective "
-                "view; leave it out and give `fov_y_deg`."
-            )
+            return eye_m + aside, np.broadcast_to(-backward, aside.shape)
+        return np.broadcast_to(eye_m, aside.shape), aside - backward
 
     @property
     def key(self) -> str:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from vtfs.bit_lists import bits_below, last_not_above, n_bits_set, pack_bits, set_bits, starts_of
 from vtfs.bounds import Aabb
@@ -102,7 +103,7 @@ def form_clusters(
         key = key + jnp.where(is_transparent_run, n_keys, 0)[:, None]
     key = jnp.where(positions.valid, key, -1)
     # Bit i of a sample's word: sample i of the same run lies in the same cell. The lowest one leads.
-    together = pack_bits(key[:, :, None] == key[:, None, :])[..., 0]
+    together = _equal_in_run(key)
     leader = n_bits_set(~together & (together - jnp.uint32(1)))
     leads = pack_bits((leader == jnp.arange(RUN)) & positions.valid)
     start, n_blocks = starts_of(n_bits_set(leads[:, 0]))
@@ -173,6 +174,18 @@ def form_clusters(
     )
 
 
+def _equal_in_run(key: Int[Array, "runs 32"]) -> UInt32[Array, "runs 32"]:
+    """For each sample one bit for each sample of its run: have they the same key?"""
+    if jax.default_backend() == "cpu":
+        return pack_bits(key[:, :, None] == key[:, None, :])[..., 0]
+    # On a GPU a thread makes a word of its own: a reduction would have 32 threads meet for each.
+    key = jax.lax.optimization_barrier(key)
+    words = jnp.zeros(key.shape, jnp.uint32)
+    for lane in range(RUN):
+        words |= (key == key[:, lane, None]).astype(jnp.uint32) << lane
+    return words
+
+
 def _farthest_solid_m(
     grid: ClusterGrid,
     positions: Positions,
@@ -197,8 +210,10 @@ def _by_page_table(block_key: Int[Array, " capacity"], in_use: Bool[Array, " cap
     """Keys of the clusters in ascending order, their number, and the cluster of each block."""
     place = jnp.arange(block_key.shape[0], dtype=jnp.int32)
     # Unused places write past the end, which `drop` leaves out.
-    flags = jnp.zeros(cells_capacity, bool).at[jnp.where(in_use, block_key, cells_capacity)].set(True, mode="drop")
-    words = pack_bits(flags.reshape(-1, RUN))
+    # Bytes are a quarter of the memory to clear, but a GPU writes one by replacing the word around it.
+    flag = jnp.bool_ if jax.default_backend() == "cpu" else jnp.int32
+    flags = jnp.zeros(cells_capacity, flag).at[jnp.where(in_use, block_key, cells_capacity)].set(True, mode="drop")
+    words = pack_bits(flags.reshape(-1, RUN) != 0)
     cell_start, n_clusters = starts_of(n_bits_set(words[:, 0]))
     row, bit = set_bits(words, cell_start, place)
     block_word = block_key // RUN

@@ -14,13 +14,17 @@ import numpy as np
 from vtfs.cluster_grid import cluster_grid, configured_grid, n_cells, n_keys, tile_and_slices
 from vtfs.gbuffer import RUN_WIDTH_PX, Fragments, GBuffer, LayerTable, Positions, from_runs
 from vtfs.input_error import InputError
-from vtfs.light_lists import view_lights
+from vtfs.light_assignment.brute_force import every_pair
+from vtfs.light_assignment.light_tree import reduce_lights, sort_lights
+from vtfs.light_lists import AssignCounts, ViewLights, view_lights
 from vtfs.light_shadows import CastMask
 from vtfs.lights import Lights
+from vtfs.morton import morton_codes
 from vtfs.op_counts import (
     ListLengths,
     OpCounts,
     added,
+    approximation_counts,
     assign_counts,
     batch_counts,
     cluster_counts,
@@ -45,11 +49,15 @@ from vtfs.shadow_techniques import (
     shadows_counts,
     with_shadow_sizes,
 )
-from vtfs.techniques import REGISTRY, Plan, Stage, volume_chunk, walk_chunk
+from vtfs.techniques import REGISTRY, Plan, Stage, Walked, approximates, assign_chunk, volume_chunk
 from vtfs.view_samples import ViewSamples
 
 _BRUTE_FORCE_WORD = 32
-_NO_STRUCTURES = ("positions", "gbuffer", "normals", "grid", "light_cutoff")
+_NO_STRUCTURES = (
+    "positions", "gbuffer", "normals", "grid", "light_cutoff", "approximate", "frame", "resort_every",
+)  # fmt: skip
+
+_SCALARS = ("grid", "light_cutoff", "approximate", "frame", "resort_every")
 
 
 class CapacityError(InputError):
@@ -102,12 +110,27 @@ def rounded_up(name: str, needed: int) -> int:
 
 
 class FrameInputs:
-    """One frame on the device: view samples and lights, uploaded once and used by every configuration."""
+    """One frame on the device: view samples and lights, uploaded once and used by every configuration.
 
-    def __init__(self, samples: ViewSamples, lights: Lights, shadow_scene: ShadowScene | None = None):
+    - `frame`: its number on the path: where `resort_every` divides it, the light tree is sorted.
+    - `earlier_lights`: where lights were in an earlier frame, in its view space; where they are now unless given.
+    - `shadow_scene`: what casts shadows, for shadow techniques.
+    """
+
+    def __init__(
+        self,
+        samples: ViewSamples,
+        lights: Lights,
+        frame: int = 0,
+        earlier_lights: Callable[[int], ViewLights] | None = None,
+        shadow_scene: ShadowScene | None = None,
+    ):
         self._shadow_scene = shadow_scene
         self._lights = lights
         self.samples = samples
+        self.frame = frame
+        self._earlier_lights = earlier_lights
+        self._orders: dict[tuple[int, float], jax.Array] = {}
         self.camera = samples.camera
         self.viewport = samples.camera.viewport
         self.lights = view_lights(lights, samples.camera)
@@ -152,6 +175,13 @@ class FrameInputs:
             self._gbuffers[key] = self.fragments(with_hidden).gbuffer(self.positions(with_hidden), precision)
         return self._gbuffers[key]
 
+    def order_of(self, frame: int, light_cutoff: float) -> jax.Array:
+        """The lights in Morton order of an earlier frame: what that frame left for those after it."""
+        if (frame, light_cutoff) not in self._orders:
+            lights = self._earlier_lights(frame) if self._earlier_lights else self.lights
+            self._orders[frame, light_cutoff] = _morton_order(lights, np.float32(light_cutoff))
+        return self._orders[frame, light_cutoff]
+
     def seen(self) -> np.ndarray:
         """Which pixels show anything: bool `[h, w]`."""
         layers = [layer.samples.valid for layer in self.samples.layers.transparent]
@@ -168,14 +198,24 @@ class FrameInputs:
             "layers": self.layers,
             "lights": self.lights,
             "light_cutoff": np.float32(params["light_cutoff"]),
+            "approximate": np.float32(params.get("approximate", 0)),
+            "cluster_light": None,
         }
+        resort_every = int(params.get("resort_every", 1))
+        if resort_every > 1:
+            last_sorted = self.frame - self.frame % resort_every
+            env["old_order"] = self.order_of(last_sorted, float(params["light_cutoff"]))
+            env |= {"frame": np.int32(self.frame), "resort_every": np.int32(resort_every)}
         if technique.lists == "clusters":
             env["grid"] = configured_grid(self.camera, params, self.deepest_m, technique.one_slice)
             # Only where they are read: each precision of the G-buffer would compile the clusters again.
-            needs_normals = params.get("normal_bins", 0) or params.get("normal_cones", "implicit") == "explicit"
+            has_cones = technique.plan(config).normal_cones == "explicit"
+            needs_normals = has_cones or params.get("normal_bins", 0)
             env["normals"] = env["gbuffer"].normal if needs_normals else None
         elif technique.lists == "light_volumes":  # for its pixels
             env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
+        # A dozen scalars, each of which would be sent to a GPU by itself in every frame: 0.3 ms.
+        env |= jax.device_put({name: env[name] for name in _SCALARS if name in env})
         if technique.casts_shadows:
             env["shadow_slots"] = self.shadows.slots
             if config.technique in SHADOW_REFERENCES:
@@ -183,6 +223,12 @@ class FrameInputs:
             else:
                 env["shadow_tasks"] = self.shadows.tasks(config)
         return env
+
+
+@jax.jit
+def _morton_order(lights: ViewLights, light_cutoff) -> jax.Array:
+    spheres = lights.spheres(light_cutoff)
+    return sort_lights(morton_codes(spheres, *reduce_lights(spheres)))
 
 
 def planned(config: Configuration, sizes: Sizes) -> Plan:
@@ -210,9 +256,13 @@ def _for_each_shadow(program: Callable[..., Any]) -> Callable[..., list[Any]]:
 
 def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
     """Add a stage's result to what later stages may need. An assignment's counts stay apart from its lists: their
-    shape depends on the tree, and would compile the shading again for every branching. So do those of shadows."""
+    shape depends on the tree, and would compile the shading again for every branching. So do those of shadows. What is
+    evaluated once a cluster leaves the lists."""
     if stage == "assign":
         env["assign"], env["assign_counts"] = result
+        env["listed"] = env["assign"]
+    elif stage == "approximate":
+        env["assign"], env["cluster_light"] = result
     elif stage == "shadow_merge":
         env["shadow_merge"] = [CastMask(mask.shadowed, mask.overflowed) for mask in result]
     else:
@@ -225,7 +275,7 @@ def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable
     One program; of shadow techniques two, as shadows are found in float64 and shaded in float32: `cast_program`, and
     from its masks to the image.
     """
-    stages = REGISTRY[technique].stages_of(has_transparent)
+    stages = REGISTRY[technique].stages_of(plan, has_transparent)
     casting = tuple(stage for stage in stages if stage.casting)
     image = _fused(tuple(stage for stage in stages if not stage.casting), replace(plan, shadow=None))
     if not casting:
@@ -294,7 +344,7 @@ def run_stages(
     sizes = fitting.covering(sizes) if sizes else fitting
     if "shadow_tasks" in env and not sizes.shadow:
         sizes = replace(sizes, shadow=cast_counted(config, inputs)[1])
-    for stage in technique.stages_of(inputs.has_transparent):
+    for stage in technique.stages_of(technique.plan(config), inputs.has_transparent):
         while True:
             plan = stage.narrowed(planned(config, sizes))
             result = stage_program(stage, plan)(*(env[name] for name in stage.needs))
@@ -326,14 +376,16 @@ def lengths_of(config: Configuration, env: dict[str, Any], inputs: FrameInputs) 
 class FrameCounts:
     """Exact counts of one frame.
 
-    - `technique`: what the technique does, whatever the `batch`; see `op_counts`.
-    - `of_block`: lengths of the blocks' lists, the `n_solid_blocks` of solid samples first; `walk_rows`,
-      `light_runs`: what `at_batch` needs besides.
+    - `technique`: what the technique as published does, whatever the `batch` and the `assigner` (but for `memory`);
+      see `op_counts`.
+    - `of_block`: lengths of the blocks' lists, the `n_solid_blocks` of solid samples first; `walked`,
+      `walk_rows`, `light_runs`: what `at_batch` needs besides.
     """
 
     technique: OpCounts
     of_block: np.ndarray
     n_solid_blocks: int
+    walked: Walked
     walk_rows: tuple[int, ...]
     light_runs: int
     branching: int
@@ -341,7 +393,7 @@ class FrameCounts:
 
     def at_batch(self, batch: int) -> OpCounts:
         """All counts, with those of this implementation's chunks."""
-        chunk = walk_chunk(batch, self.branching, self.sizes.pairs)
+        chunk = assign_chunk(self.walked, batch, self.branching, self.sizes.pairs)
         capacity = self.sizes.blocks or len(self.of_block)
         own = batch_counts(self.of_block, self.n_solid_blocks, self.walk_rows, batch, capacity, chunk)
         if self.light_runs:
@@ -360,6 +412,7 @@ class FrameCounts:
             "counts": np.array(list(self.technique.values()), np.int64),
             "of_block": self.of_block,
             "scalars": np.array([self.n_solid_blocks, self.light_runs, self.branching, *sizes], np.int64),
+            "walked": np.array(self.walked),
             "walk_rows": np.array(self.walk_rows, np.int64),
         }
 
@@ -369,7 +422,8 @@ class FrameCounts:
         walk_rows = tuple(int(rows) for rows in arrays["walk_rows"])
         n_solid_blocks, light_runs, branching, cells, blocks, pairs, *shadow = (int(v) for v in arrays["scalars"])
         sizes = Sizes(cells, blocks, pairs, tuple(shadow))
-        return cls(technique, arrays["of_block"], n_solid_blocks, walk_rows, light_runs, branching, sizes)
+        walked: Walked = str(arrays["walked"])  # type: ignore[assignment]
+        return cls(technique, arrays["of_block"], n_solid_blocks, walked, walk_rows, light_runs, branching, sizes)
 
 
 def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None) -> tuple[FrameCounts, ListLengths]:
@@ -378,7 +432,8 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
         return _count_shadowed(config, inputs, sizes)
     technique = REGISTRY[config.technique]
     if is_listed(config):
-        env, sizes = run_stages(config, inputs, sizes, until="assign")
+        last = "approximate" if approximates(config) else "assign"
+        env, sizes = run_stages(config, inputs, sizes, until=last)
     else:
         env, sizes = inputs.environment(config), NO_SIZES
     lengths = lengths_of(config, env, inputs)
@@ -387,11 +442,12 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     fragments = inputs.fragments(technique.shades_hidden(config))
     counts = shading_counts(lengths, fragments.n_samples, fragments.n_transparent_samples, tile_px)
     counts |= {"hidden_fragments": fragments.n_samples - inputs.fragments(with_hidden=False).n_samples}
-    rows: tuple[int, ...] = ()
-    light_runs = 0
+    walked, rows, light_runs = technique.walked(technique.plan(config), inputs.n_lights), (), 0
     if technique.lists == "clusters":
-        counts |= cluster_counts(lengths, n_cells(env["grid"], inputs.viewport), inputs.n_lights)
-        counts |= assign_counts(env["assign_counts"], inputs.n_lights, branching)
+        listed = list_lengths(env["positions"], env["clusters"], env["listed"])
+        counts |= cluster_counts(listed, n_cells(env["grid"], inputs.viewport), inputs.n_lights)
+        counts |= approximation_counts(listed, lengths)
+        counts |= assign_counts(_published_counts(config, env, inputs), inputs.n_lights, branching)
         rows = walk_rows(env["assign_counts"])
         if technique.one_slice:
             counts["lighting_computations_tile_area"] = counts["light_cluster_pairs"] * tile_px[0] * tile_px[1]
@@ -399,10 +455,13 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
         light_runs = int(env["assign"].total)
         n_tests = inputs.n_lights * inputs.positions(with_hidden=False).n_visible_runs
         counts |= {"lights": inputs.n_lights, "leaf_tests": n_tests, "light_runs": light_runs}
-    structures = [value for name, value in env.items() if name not in _NO_STRUCTURES]
+    # By identity: lists that nothing was taken off are those that were assigned.
+    structures = list({id(value): value for name, value in env.items() if name not in _NO_STRUCTURES}.values())
     counts |= memory_counts(env["gbuffer"], structures, fragments.n_samples, counts.get("light_cluster_pairs", 0))
     counts |= gbuffer_traffic(technique.reads_gbuffer, counts)
-    frame_counts = FrameCounts(counts, lengths.of_block, lengths.n_solid_blocks, rows, light_runs, branching, sizes)
+    frame_counts = FrameCounts(
+        counts, lengths.of_block, lengths.n_solid_blocks, walked, rows, light_runs, branching, sizes
+    )
     return frame_counts, lengths
 
 
@@ -437,6 +496,17 @@ def cast_counted(config: Configuration, inputs: FrameInputs) -> tuple[list[CastS
     frames = [receiving(task) for task in tasks]
     plan, masks = fitted_to_all(config.technique, shadow_plan(config), frames, run=run)
     return [on_host(mask, plan, frame) for mask, frame in zip(masks, frames, strict=True)], shadow_sizes(plan)
+
+
+def _published_counts(config: Configuration, env: dict[str, Any], inputs: FrameInputs) -> AssignCounts:
+    """What the technique's own assigner does, however the lists of `env` were made."""
+    technique = REGISTRY[config.technique]
+    published = replace(technique.plan(config), assigner="published")
+    if technique.walked(published, inputs.n_lights) == "all_pairs":
+        return every_pair(int(env["clusters"].n_clusters), inputs.n_lights)
+    if technique.plan(config) == published:
+        return env["assign_counts"]
+    return run_stages(config.replaced(assigner="published"), inputs, until="assign")[0]["assign_counts"]
 
 
 def is_listed(config: Configuration) -> bool:

@@ -31,6 +31,7 @@ class Positions(eqx.Module):
     hold any, padded to few sizes.
 
     - `place`: which box of 8 x 4 pixels each run covers, counted along the rows of the image.
+    - `is_parallel`: the eye is at infinity.
     """
 
     x_m: Float[Array, "runs 32"]
@@ -41,6 +42,7 @@ class Positions(eqx.Module):
     viewport: Viewport = eqx.field(static=True)
     n_hidden_runs: int = eqx.field(static=True, default=0)
     n_transparent_runs: int = eqx.field(static=True, default=0)
+    is_parallel: bool = eqx.field(static=True, default=False)
 
     @property
     def n_solid_runs(self) -> int:
@@ -100,6 +102,7 @@ class Fragments:
         hidden = samples.layers.hidden if with_hidden else ()
         self._transparent = samples.layers.transparent
         self.viewport = samples.camera.viewport
+        self._is_parallel = samples.camera.is_orthographic
         self.n_visible_runs = runs_across(self.viewport) * -(-self.viewport.height_px // RUN_HEIGHT_PX)
         self._sections = [(samples, np.arange(self.n_visible_runs))]
         self._hidden = [(layer, _runs_with_any(layer.valid)) for layer in hidden]
@@ -136,7 +139,9 @@ class Fragments:
         x_m, y_m, z_m = (jax.device_put(self.channel(lambda s, c=c: s.position_m[..., c])) for c in range(3))
         valid = jax.device_put(self.channel(lambda s: s.valid))
         places = jax.device_put(np.concatenate(place).astype(np.int32))
-        return Positions(x_m, y_m, z_m, valid, places, self.viewport, self.n_hidden_runs, self.n_transparent_runs)
+        return Positions(
+            x_m, y_m, z_m, valid, places, self.viewport, self.n_hidden_runs, self.n_transparent_runs, self._is_parallel
+        )
 
     def gbuffer(self, positions: Positions, precision: str) -> GBuffer:
         """Upload the channels in `precision`: `float32`, `float16` or `bfloat16`."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from vtfs.bit_lists import WORD_BITS, gather_hits, pack_bits
-from vtfs.bounds import Sphere
+from vtfs.bounds import SLACK, Sphere
 from vtfs.cluster_grid import ClusterGrid
 from vtfs.gbuffer import RUN, RUN_HEIGHT_PX, RUN_WIDTH_PX, GBuffer, Positions, runs_across
 from vtfs.shading import Image, Surface, reflected, surface_of
@@ -58,8 +58,9 @@ def draw_light_volumes(
         low_y = grid.slope_y - (top_px + RUN_HEIGHT_PX + _PIXEL_SLACK_PX) * grid.slope_per_px
 
         def is_within(along, slope):
-            """Not wholly beyond the plane through the eye on which `along = slope * depth`."""
-            return along - slope * depth >= -radius * jnp.sqrt(1 + slope * slope)
+            """Not wholly beyond the plane on which `along = slope * depth`; in a parallel view, `along = slope`."""
+            width = grid.converges * depth + (1 - grid.converges)
+            return along - slope * width >= -radius * jnp.sqrt(1 + grid.converges * slope * slope)
 
         inside = is_within(x, low_x) & is_within(-x, -high_x) & is_within(y, low_y) & is_within(-y, -high_y)
         return inside & (depth >= -radius) & jnp.isfinite(x) & (run < n_runs)
@@ -91,7 +92,8 @@ def _covered(
 ) -> Bool[Array, "chunk 32"]:
     x_m, y_m, z_m = positions.x_m[run], positions.y_m[run], positions.z_m[run]
     dx, dy, dz = x_m - sphere.x_m, y_m - sphere.y_m, z_m - sphere.z_m
-    is_inside = positions.valid[run] & (dx * dx + dy * dy + dz * dz <= sphere.radius_m * sphere.radius_m)
+    radius2 = sphere.radius_m * sphere.radius_m
+    is_inside = positions.valid[run] & (dx * dx + dy * dy + dz * dz <= radius2 * (1 + SLACK))
     if stencil:
         return is_inside
     lane = jnp.arange(RUN, dtype=jnp.int32)[None, :]
@@ -100,16 +102,20 @@ def _covered(
     y_px = run[:, None] // across * RUN_HEIGHT_PX + lane // RUN_WIDTH_PX
     a = grid.slope_x + (x_px + 0.5) * grid.slope_per_px
     b = grid.slope_y - (y_px + 0.5) * grid.slope_per_px
-    # The ray (a, b, -1) passes the centre c at the distance |c x r| / |r|.
-    cross_x = sphere.y_m * -1 - sphere.z_m * b
-    cross_y = sphere.z_m * a + sphere.x_m
-    cross_z = sphere.x_m * b - sphere.y_m * a
+    # The ray r = (a, b, -1) from the eye passes the centre c at the distance |c x r| / |r|. In a parallel view rays
+    # start at (a, b, 0), and r is (0, 0, -1).
+    p = grid.converges
+    centre_x, centre_y, centre_z = sphere.x_m - (1 - p) * a, sphere.y_m - (1 - p) * b, sphere.z_m
+    a, b = p * a, p * b
+    cross_x = -centre_y - centre_z * b
+    cross_y = centre_z * a + centre_x
+    cross_z = centre_x * b - centre_y * a
     squared = cross_x * cross_x + cross_y * cross_y + cross_z * cross_z
-    r2, radius2 = a * a + b * b + 1, sphere.radius_m * sphere.radius_m
-    is_ahead = sphere.x_m * a + sphere.y_m * b - sphere.z_m > 0
-    holds_eye = sphere.x_m**2 + sphere.y_m**2 + sphere.z_m**2 <= radius2
+    r2 = a * a + b * b + 1
+    is_ahead = centre_x * a + centre_y * b - centre_z > 0
+    holds_start = centre_x**2 + centre_y**2 + centre_z**2 <= radius2
     is_in_image = (x_px < positions.viewport.width_px) & (y_px < positions.viewport.height_px)
-    return is_in_image & (is_inside | holds_eye | (is_ahead & (squared <= radius2 * r2)))
+    return is_in_image & (is_inside | holds_start | (is_ahead & (squared <= radius2 * r2)))
 
 
 def shade_light_volumes(

@@ -28,11 +28,13 @@ class NodeLists(eqx.Module):
     Node `m` has groups `start[m]` to `start[m + 1]`, and `count[m]` triangles in them.
 
     - `triangle`: of each group; what a list does not fill is `absent`, a triangle that meets nothing.
+    - `node`: of each group, where it is known: else `nodes` finds it.
     """
 
     triangle: Int[Array, "groups lanes"]
     start: Int[Array, " nodes_and_1"]
     count: Int[Array, " nodes"]
+    node: Int[Array, " groups"] | None = None
 
     @property
     def n_groups(self) -> Int[Array, ""]:
@@ -41,6 +43,17 @@ class NodeLists(eqx.Module):
     @property
     def overflowed(self) -> Bool[Array, ""]:
         return self.n_groups > self.triangle.shape[0]
+
+    def nodes(self) -> Int[Array, " groups"]:
+        """The node of each group; of one that is not used any node."""
+        if self.node is not None:
+            return self.node
+        group = jnp.arange(self.triangle.shape[0], dtype=jnp.int32)
+        return jnp.minimum(last_not_above(self.start, group), self.count.shape[0] - 1)
+
+    def of_first(self, n: int) -> NodeLists:
+        """Without the nodes from the `n`-th on, whose lists are empty."""
+        return NodeLists(self.triangle, self.start[: n + 1], self.count[:n], self.node)
 
 
 def group_starts(count: Int[Array, " nodes"], lanes: int) -> Int[Array, " nodes_and_1"]:
@@ -56,11 +69,11 @@ def one_list(member: Bool[Array, " triangles"], lanes: int, absent: int) -> Node
     ends = jnp.cumsum(member, dtype=jnp.int32)
     count = ends[-1:]
     n_groups = -(-n // lanes)
-    place = jnp.arange(n_groups * lanes, dtype=jnp.int32)
-    # The k-th member is where the inclusive count first reaches k + 1.
-    found = last_not_above(jnp.concatenate([jnp.zeros(1, jnp.int32), ends]), place)
-    triangle = jnp.where(place < count, jnp.minimum(found, n - 1), absent)
-    return NodeLists(triangle.reshape(n_groups, lanes), group_starts(count, lanes), count)
+    place = jnp.where(member, ends - 1, n_groups * lanes)
+    triangle = jnp.full(n_groups * lanes, absent, jnp.int32)
+    triangle = triangle.at[place].set(jnp.arange(n, dtype=jnp.int32), mode="drop", unique_indices=True)
+    node = jnp.zeros(n_groups, jnp.int32)
+    return NodeLists(triangle.reshape(n_groups, lanes), group_starts(count, lanes), count, node)
 
 
 Pairs = tuple[Int[Array, " capacity"], Int[Array, " capacity"]]
@@ -242,9 +255,8 @@ def split_at_once(
     n_in, lanes_in = lists.triangle.shape
     n_nodes = lists.count.shape[0]
     n_groups = jnp.minimum(lists.n_groups, n_in)
-    group = jnp.arange(n_in, dtype=jnp.int32)
-    node = jnp.minimum(last_not_above(lists.start, group), n_nodes - 1)
-    is_live = (group < n_groups)[:, None]
+    node = lists.nodes()
+    is_live = (jnp.arange(n_in, dtype=jnp.int32) < n_groups)[:, None]
     triangle = jnp.where(is_live, lists.triangle, absent)
     goes_on, accepting, extra = test(triangle, node)
 
@@ -265,12 +277,12 @@ def split_at_once(
     word = goes_on[:, :, None]
     place = first[:, :, None] + n_bits_set(word & bits_below(lane))
     place = jnp.where((word >> lane.astype(jnp.uint32) & 1) == 1, place, capacity * lanes)
-    listed = jnp.broadcast_to(triangle[:, None, :], place.shape)
-    out = jnp.full(capacity * lanes, absent, jnp.int32).at[place].set(listed, mode="drop", unique_indices=True)
-    return Split(
-        NodeLists(out.reshape(capacity, lanes), start, kept), accepts, *_totals(accepts, count, kept),
-        extra.astype(jnp.int64),
-    )  # fmt: skip
+    # Each takes its node along, so that nobody has to look for a group's.
+    listed = child[:, :, None].astype(jnp.int64) << 32 | triangle[:, None, :]
+    out = jnp.full(capacity * lanes, absent, jnp.int64).at[place].set(listed, mode="drop", unique_indices=True)
+    out = out.reshape(capacity, lanes)
+    written = NodeLists((out & (2**32 - 1)).astype(jnp.int32), start, kept, (out[:, 0] >> 32).astype(jnp.int32))
+    return Split(written, accepts, *_totals(accepts, count, kept), extra.astype(jnp.int64))
 
 
 def _whole_chunks(n: int, chunk: int) -> int:

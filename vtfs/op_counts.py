@@ -170,6 +170,14 @@ def cluster_counts(lengths: ListLengths, cells_total: int, n_lights: int) -> OpC
     }
 
 
+def approximation_counts(listed: ListLengths, kept: ListLengths) -> OpCounts:
+    """What `approximate` saves: (cluster, light) pairs evaluated once, and the lighting computations that their samples
+    would have taken."""
+    saved = listed.of_sample.sum(dtype=np.int64) - kept.of_sample.sum(dtype=np.int64)
+    once = listed.of_cluster.sum(dtype=np.int64) - kept.of_cluster.sum(dtype=np.int64)
+    return {"approximated_pairs": int(once), "lighting_computations_saved": int(saved)}
+
+
 def assign_counts(counts: AssignCounts, n_lights: int, branching: int) -> OpCounts:
     """Tests of existing children of inner nodes, and of lights."""
     levels = inner_level_nodes(n_lights, branching) if len(counts.node_rows) else ()

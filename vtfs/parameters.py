@@ -103,6 +103,22 @@ PARAMETERS: dict[str, Parameter] = {
         ),
         Parameter("branching", 32, "children of a node of the tree", choices=(2, 4, 8, 16, 32, 64)),
         Parameter(
+            "resort_every",
+            1,
+            "frames from one sort of the light tree to the next; between them its order is kept and its boxes are "
+            "refitted. Above 1 lists are made as published, by that tree",
+            low=1,
+            high=64,
+        ),
+        Parameter(
+            "assigner",
+            "auto",
+            "how lists are made, which never changes them: as published (all lights against all cells, or a tree of "
+            "lights), from groups of cells to cells, or, as faster on the device, all pairs while lights are few, "
+            "then groups",
+            choices=("auto", "published", "coarse_to_fine"),
+        ),
+        Parameter(
             "batch",
             0,
             "queries in one chunk: clusters when assigning, samples when shading, triangles when casting shadows; "
@@ -179,6 +195,13 @@ PARAMETERS: dict[str, Parameter] = {
             "z-pass starts with the volumes around the eye; off, as in textbooks, it fails inside of one",
             choices=("on", "off"),
         ),
+        Parameter(
+            "approximate",
+            0.0,
+            "lights that vary by at most this over a cluster, as a share of all light there, are evaluated once for it",
+            low=0.0,
+            high=1.0,
+        ),
     )
 }
 
@@ -186,16 +209,20 @@ _TILES = ("tile_px", "tile_px_x", "tile_px_y", "grid")
 _SLICES = ("depth_slices", "depth_scheme")
 _CLUSTERS = ("bounds", "cull", "unique", "normal_bins", "normal_cones")
 _SHADING = ("gbuffer", "light_cutoff")
-_BRUTE_FORCE = ("batch", *_CLUSTERS, *_SHADING)
-_BY_TREE = (*_TILES, *_SLICES, "branching", "batch", *_CLUSTERS, "leaf_test", *_SHADING)
+_BRUTE_FORCE = ("assigner", "batch", *_CLUSTERS, *_SHADING, "approximate")
+_TREE = ("branching", "resort_every", "assigner")
+_BY_TREE = (*_TILES, *_SLICES, *_TREE, "batch", *_CLUSTERS, "leaf_test", *_SHADING, "approximate")
 _VOLUMES = ("tile_px", "branching", "batch", "planes", "feedback", "passes", "level", "front_faces")
 _STENCIL = ("tile_px", "branching", "stencil", "front_faces")
+
+ACCURACY = ("gbuffer", "light_cutoff", "approximate", "front_faces", "stencil", "around_eye")
+"""Parameters that change the image: their defaults are exact."""
 
 TECHNIQUES: dict[str, tuple[str, ...]] = {
     "forward": ("prepass", "batch", *_SHADING),
     "deferred": ("batch", *_SHADING),
     "deferred_stencil": ("batch", *_SHADING),
-    "tiled_forward": (*_TILES, "batch", "cull", *_SHADING),
+    "tiled_forward": (*_TILES, "assigner", "batch", "cull", *_SHADING),
     "tiled_forward_prez": (*_TILES, *_BRUTE_FORCE),
     "tiled_deferred": (*_TILES, *_BRUTE_FORCE),
     "clustered_deferred": _BY_TREE,
@@ -220,9 +247,6 @@ SHADOW_REFERENCES = ("shadow_rays", "brute_force")
 LISTS_OF_SHADOWED = "clustered_deferred"
 """Whose light lists, at its defaults, a shadow technique shades with."""
 
-CHANGES_IMAGE = ("gbuffer", "light_cutoff", "front_faces", "stencil", "around_eye")
-"""Parameters whose other values trade accuracy for speed."""
-
 TUNED_TECHNIQUES = ("forward", "tiled_deferred", "volume_tiled_bvh")
 """What a search compares unless the user says otherwise. Nothing is rasterised here, so that techniques which differ
 in their passes over the geometry run the same programs: `tiled_forward_prez` those of `tiled_deferred`,
@@ -233,6 +257,11 @@ _OWN_DEFAULTS: dict[tuple[str, str], Value] = {
     ("tiled_forward_prez", "bounds"): "depth_range",
     ("cluster_hierarchy", "bounds"): "explicit",
     **{(name, "tile_px"): 8 for name in ("z_pass", "z_fail", "ptsv", "cluster_hierarchy")},
+    # What tells these from one another is how they make their lists.
+    ("volume_tiled", "assigner"): "published",
+    ("volume_tiled_bvh", "assigner"): "published",
+    ("clustered_deferred", "assigner"): "published",
+    ("clustered_forward", "assigner"): "published",
 }
 
 _OWN_CHOICES: dict[tuple[str, str], tuple[Value, ...]] = {("cluster_hierarchy", "bounds"): ("implicit", "explicit")}
@@ -271,6 +300,15 @@ class Configuration:
         changed = [f"{name}={value}" for name, value in self.items if value != default_value(self.technique, name)]
         return " ".join([self.technique, *changed])
 
+    def exact(self) -> Configuration:
+        """The same without what trades accuracy for speed."""
+        exact = {name: default_value(self.technique, name) for name in ACCURACY if name in self.params}
+        return self.replaced(**exact)
+
+    @property
+    def is_exact(self) -> bool:
+        return self == self.exact()
+
     def replaced(self, **changes: Value) -> Configuration:
         """The same configuration with some values changed."""
         return configuration(self.technique, {**self.params, **changes})
@@ -298,17 +336,6 @@ def configuration(technique: str, params: Mapping[str, object] | None = None) ->
     }
     settled = _settled(technique, parsed)
     return Configuration(technique, tuple((name, settled[name]) for name in names))
-
-
-def exact_configuration(config: Configuration) -> Configuration:
-    """The same without what trades accuracy for speed."""
-    names = [name for name in CHANGES_IMAGE if name in config.params]
-    return config.replaced(**{name: default_value(config.technique, name) for name in names})
-
-
-def is_exact(config: Configuration) -> bool:
-    """Must its image be that of the reference?"""
-    return config == exact_configuration(config)
 
 
 def changes_shadows(config: Configuration) -> bool:
@@ -376,4 +403,15 @@ def _settled(technique: str, params: dict[str, Value]) -> dict[str, Value]:
             params["cull"] = "frustum"  # nor is the cell a box
         elif params["bounds"] == "frustum" and not exact:
             params["bounds"] = "implicit"
+    if params.get("assigner") == "coarse_to_fine" and not passes_only_what_meets_the_box(params):
+        name = "leaf_test" if params.get("leaf_test") == "box" else "cull"
+        raise ConflictError(
+            f"parameter `assigner` = 'coarse_to_fine' with {name}={params[name]}: groups are tested by their boxes, "
+            "which that test does not keep to; give cull=box or frustum and leaf_test=sphere, or assigner=published."
+        )
     return params
+
+
+def passes_only_what_meets_the_box(params: Mapping[str, Value]) -> bool:
+    """Is a light listed only where its sphere meets the box of the cell? Lists of groups of cells rely on it."""
+    return params.get("cull", "box") in ("box", "frustum") and params.get("leaf_test", "sphere") == "sphere"

@@ -97,7 +97,10 @@ def _shade(
     distance2 = np.einsum("cp,cp->p", to, to)
     to_unit = to / np.sqrt(distance2)
     window = (1 - (distance2 / view.range_m[light] ** 2) ** 2) ** 2
-    from_eye = position / np.linalg.norm(position, axis=1, keepdims=True)
+    if samples.camera.is_orthographic:
+        from_eye = np.broadcast_to([0.0, 0.0, -1.0], position.shape)
+    else:
+        from_eye = position / np.linalg.norm(position, axis=1, keepdims=True)
     n = normal[sample].T
     n_dot_h = _highlight(to_unit, n, from_eye[sample].T)
     along = -np.einsum("cp,pc->p", to_unit, view.direction[light])

@@ -16,10 +16,11 @@ from vtfs.cache import cached
 from vtfs.camera import CameraPath, Viewport, default_cameras, load_cameras
 from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
 from vtfs.gallery import GALLERY, build_scene
+from vtfs.gbuffer_files import load_gbuffer
 from vtfs.input_error import InputError
 from vtfs.lights import Lights, load_lights, scatter_lights
 from vtfs.scene import Scene, load_scene
-from vtfs.view_samples import Tracer, ViewSamples, load_gbuffer, trace_view_samples
+from vtfs.view_samples import Tracer, ViewSamples, trace_view_samples
 
 if TYPE_CHECKING:
     from vtfs.frame import FrameInputs
@@ -99,7 +100,7 @@ class SceneSetup:
         """A frame on the device."""
         from vtfs.frame import FrameInputs  # a scene is set up without the programs too
 
-        return FrameInputs(self.samples(frame), self.lights, self.shadow_scene)
+        return FrameInputs(self.samples(frame), self.lights, frame, shadow_scene=self.shadow_scene)
 
     @cached_property
     def shadow_scene(self) -> ShadowScene | None:

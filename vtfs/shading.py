@@ -31,9 +31,26 @@ class Surface(eqx.Module):
     shininess: Float[Array, "*s"]
 
 
-def direction_to_eye(position_m: tuple[Float[Array, "*s"], ...]) -> tuple[Float[Array, "*s"], ...]:
-    """Unit vectors to the eye, which is the origin of view space."""
+class ClusterLight(eqx.Module):
+    """What lights add that are evaluated once a cluster: irradiance and highlight; red, green and blue of each."""
+
+    irradiance: tuple[Float[Array, " clusters"], ...]
+    highlight: tuple[Float[Array, " clusters"], ...]
+
+    def reflected_by(self, part: GBuffer, cluster: Int[Array, " blocks"]) -> tuple[Float[Array, "blocks 32"], ...]:
+        """Red, green and blue that the samples of each block reflect."""
+        return tuple(
+            base.astype(jnp.float32) * irradiance[cluster][:, None]
+            + part.specular.astype(jnp.float32) * highlight[cluster][:, None]
+            for base, irradiance, highlight in zip(part.base_colour, self.irradiance, self.highlight, strict=True)
+        )
+
+
+def direction_to_eye(position_m: tuple[Float[Array, "*s"], ...], is_parallel: bool) -> tuple[Float[Array, "*s"], ...]:
+    """Unit vectors to the eye: the origin of view space, or in a parallel view at infinity along z."""
     x_m, y_m, z_m = position_m
+    if is_parallel:
+        return jnp.zeros_like(x_m), jnp.zeros_like(y_m), jnp.ones_like(z_m)
     inverse = -jax.lax.rsqrt(x_m * x_m + y_m * y_m + z_m * z_m + _TINY)
     return x_m * inverse, y_m * inverse, z_m * inverse
 
@@ -41,7 +58,7 @@ def direction_to_eye(position_m: tuple[Float[Array, "*s"], ...]) -> tuple[Float[
 def surface_of(part: GBuffer) -> Surface:
     """What is lit, in the precision of the channels."""
     position_m = (part.positions.x_m, part.positions.y_m, part.positions.z_m)
-    to_eye = direction_to_eye(position_m)
+    to_eye = direction_to_eye(position_m, part.positions.is_parallel)
     return Surface(position_m, to_eye, part.normal, part.base_colour, part.specular, part.shininess)
 
 
@@ -184,6 +201,7 @@ def shade(
     batch: int,
     transparent: bool = False,
     shadows: LightShadows | None = None,
+    cluster_light: ClusterLight | None = None,
 ) -> Image:
     """Shade every valid sample with its cluster's lights: linear red, green and blue, 0 where invalid.
 
@@ -194,6 +212,7 @@ def shade(
 
     - `transparent`: shade the transparent runs, and return those; else the solid ones, and return the visible.
     - `shadows`: a light adds nothing where a sample lies in its shadow, and directional lights shine too.
+    - `cluster_light`: what is not on the lists but adds to all samples of a cluster.
     """
     capacity = clusters.block_run.shape[0]
     chunk = chunk_blocks(capacity, batch)
@@ -244,6 +263,9 @@ def shade(
         if shade_of is not None:
             surface = jax.tree.map(lambda channel: channel.astype(jnp.float32), surface_of(part))
             sums = tuple(s + a for s, a in zip(sums, reflected_suns(surface, shade_of), strict=True))
+        if cluster_light is not None:
+            once = cluster_light.reflected_by(part, clusters.block_cluster[block])
+            sums = tuple(s + a for s, a in zip(sums, once, strict=True))
         k = jnp.int32(0)
         for width, narrower in zip(widths, (*widths[1:], 0), strict=True):
             # Not the first one's length: very long lists are not in order among themselves.

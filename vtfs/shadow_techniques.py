@@ -214,11 +214,16 @@ def fitted_to_all(
             raise InputError(f"{technique}: the frame fits no capacity; use larger tiles or a batch.")
         plan = grown
     if jax.default_backend() != "cpu" if unrolled is None else unrolled:
-        levels = tuple(_rounded_up("lists", int(n), 2**6) for n in needed[1:-1])
-        leaf_groups = _rounded_up("leaf lists", int(needed[-1]), 2**6)
+        levels = tuple(_rounded_up_finely(int(n)) for n in needed[1:-1])
         if levels:
-            plan = replace(plan, level_groups=levels, leaf_groups=leaf_groups, groups=0)
+            plan = replace(plan, level_groups=levels, leaf_groups=_rounded_up_finely(int(needed[-1])), groups=0)
     return plan, masks
+
+
+def _rounded_up_finely(needed: int) -> int:
+    """Eighths of powers of 2: without a loop, what is not needed is computed all the same."""
+    step = 1 << max(6, needed.bit_length() - 4)
+    return max(1, -(-needed // step)) * step
 
 
 def _more(needed: np.integer, capacity: int) -> int:

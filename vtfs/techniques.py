@@ -13,14 +13,18 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
+from vtfs.bit_lists import WORD_BITS
 from vtfs.cluster_grid import ClusterGrid
+from vtfs.cluster_light import split_lists
 from vtfs.clusters import Bounds, Clusters, Unique, everything, form_clusters
 from vtfs.gbuffer import GBuffer, LayerTable, Positions
 from vtfs.light_assignment.brute_force import assign_brute_force
+from vtfs.light_assignment.coarse_to_fine import GROUP, assign_coarse_to_fine
 from vtfs.light_assignment.light_tree import (
     LightTree,
     assign_tree,
     build_light_tree,
+    order_lights,
     reduce_lights,
     sort_lights,
 )
@@ -30,8 +34,14 @@ from vtfs.light_shadows import CastMask, LightShadows, ShadowSlots, shadow_bits
 from vtfs.light_volumes import LightPixels, draw_light_volumes, shade_light_volumes
 from vtfs.morton import morton_codes
 from vtfs.normal_cones import Components, ConeKind
-from vtfs.parameters import SHADOW_NAMES, SHADOW_REFERENCES, Configuration, lists_configuration
-from vtfs.shading import Image, blend_layers, chunk_blocks, shade
+from vtfs.parameters import (
+    SHADOW_NAMES,
+    SHADOW_REFERENCES,
+    Configuration,
+    lists_configuration,
+    passes_only_what_meets_the_box,
+)
+from vtfs.shading import ClusterLight, Image, blend_layers, chunk_blocks, shade
 from vtfs.shadow_mask import ShadowPlan
 from vtfs.shadow_stages import CastingStage, casting_stages
 from vtfs.shadow_techniques import shadow_plan
@@ -40,12 +50,25 @@ _TESTS_AT_ONCE = {"cpu": 2**19, "gpu": 2**22}
 """`batch = 0` means all queries at once, as far as their rows of boxes stay in the cache of a CPU (12 MB) or leave
 the memory of a GPU to others (100 MB)."""
 
+_WORDS_AT_ONCE = {"cpu": 2**14, "gpu": 2**22}
+"""The same, in words of 32 tests, where lists are refined: one light is loaded for all cells of a group."""
+
+_FEW_LIGHTS = {"cpu": 256, "gpu": 256}
+"""Up to so many lights `auto` tests all pairs; see `benchmarks/light_assignment.py`."""
+
+Assigner = Literal["published", "coarse_to_fine", "auto"]
+Walked = Literal["all_pairs", "tree", "groups"]
+"""How lists were made: every light against every cell, by a tree of lights, or from groups of cells to cells."""
+
 
 @dataclass(frozen=True)
 class Plan:
     """What is static in a frame's programs: it fixes array shapes. A stage sees only what it names.
 
     - `two_lists`: transparent samples have lists of their own.
+    - `keeps_order`: the light tree is sorted in some frames only.
+    - `approximates`: lights that vary little over a cluster are evaluated once for it.
+    - `assigner`: `published` also where `auto` has no choice.
     - `cells`, `blocks`, `pairs`: rounded capacities (see `frame.Sizes`).
     - `shadow`: of shadow techniques, with capacities of its own.
     """
@@ -57,7 +80,10 @@ class Plan:
     unique: Unique = "page_table"
     normal_cones: ConeKind = "implicit"
     sections: bool = False
+    approximates: bool = False
+    keeps_order: bool = False
     branching: int = 0
+    assigner: Assigner = "published"
     batch: int = 0
     cells: int = 0
     blocks: int = 0
@@ -69,8 +95,10 @@ class Plan:
 class Stage:
     """One step of a frame, timed apart.
 
-    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`, of shadow
-      techniques `shadow_tasks` and `shadow_slots`) and earlier stages.
+    - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`, `approximate`, for
+      kept orders `old_order`, `frame`, `resort_every`, of shadow techniques `shadow_tasks` and `shadow_slots`) and
+      earlier stages. `listed` are the lists as assigned, `assign` those without what is evaluated once a cluster, and
+      `cluster_light` is that, or None.
     - `statics`: the fields of `Plan` that its program depends on.
     - `casting`: it runs once for each light that casts and each view, in float64: what it needs and its results are
       lists.
@@ -121,15 +149,22 @@ class Technique:
             lists = lists_configuration(config)
             return replace(REGISTRY[lists.technique].plan(lists), shadow=shadow_plan(config))
         params = config.params
+        keeps_order = int(params.get("resort_every", 1)) > 1
+        has_choice = passes_only_what_meets_the_box(params) and not keeps_order  # only a tree has an order to keep
+        assigner = params.get("assigner", "published") if has_choice else "published"
         return Plan(
             bounds=params.get("bounds", "implicit"),  # type: ignore[arg-type]
             two_lists=self.two_lists,
             cull=params.get("cull", "box"),  # type: ignore[arg-type]
             leaf_test=params.get("leaf_test", "sphere"),  # type: ignore[arg-type]
             unique=params.get("unique", "page_table"),  # type: ignore[arg-type]
-            normal_cones=params.get("normal_cones", "implicit"),  # type: ignore[arg-type]
+            # How much light varies depends on where samples face, so that is found out.
+            normal_cones="explicit" if approximates(config) else params.get("normal_cones", "implicit"),  # type: ignore[arg-type]
             sections=needs_sections(params.get("cull", "box")),  # type: ignore[arg-type]
+            approximates=approximates(config),
+            keeps_order=keeps_order,
             branching=int(params.get("branching", 0)),
+            assigner=assigner,  # type: ignore[arg-type]
             batch=int(params.get("batch", 0)),
         )
 
@@ -137,9 +172,26 @@ class Technique:
         """Are fragments shaded that end up hidden?"""
         return config.params.get("prepass", "off" if self.without_prepass else "on") == "off"
 
-    def stages_of(self, has_transparent: bool) -> tuple[Stage, ...]:
-        """The stages of a frame; that of transparent samples only where there are any."""
-        return tuple(stage for stage in self.stages if has_transparent or stage.name != "shade_transparent")
+    def stages_of(self, plan: Plan, has_transparent: bool) -> tuple[Stage, ...]:
+        """The stages of a frame; that of transparent samples only where there are any, a tree of lights only where the
+        lists are made as published, and one stage that sorts them or not in place of three where their order is kept.
+        """
+        stages = self.stages if plan.assigner == "published" else _without_tree(self.stages)
+        left_out = {"shade_transparent": not has_transparent, "approximate": not plan.approximates}
+        left_out |= dict.fromkeys(("reduce", "morton"), plan.keeps_order)
+        stages = (_SORT_OR_KEEP if stage is _SORT and plan.keeps_order else stage for stage in stages)
+        return tuple(stage for stage in stages if not left_out.get(stage.name, False))
+
+    def walked(self, plan: Plan, n_lights: int) -> Walked:
+        """How lists are made of so many lights on this device."""
+        if plan.assigner == "published":
+            return "tree" if _BUILD_TREE in self.stages else "all_pairs"
+        return _fastest(n_lights) if plan.assigner == "auto" else "groups"
+
+
+def approximates(config: Configuration) -> bool:
+    """Are some lights evaluated once a cluster?"""
+    return float(config.params.get("approximate", 0)) > 0
 
 
 Assigned = tuple[LightLists, AssignCounts]
@@ -175,6 +227,26 @@ def _assign_brute_force(plan: Plan, lights: ViewLights, light_cutoff, clusters: 
     return assign_brute_force(lights.spheres(light_cutoff), clusters, plan.pairs, chunk, plan.cull, lights.cones)
 
 
+def _fastest(n_lights: int) -> Walked:
+    return "all_pairs" if n_lights <= _FEW_LIGHTS.get(jax.default_backend(), 0) else "groups"
+
+
+def _assign_otherwise(plan: Plan, lights: ViewLights, light_cutoff, clusters: Clusters) -> Assigned:
+    """Not as published: no tree of lights."""
+    if plan.assigner == "auto" and _fastest(lights.n_lights) == "all_pairs":
+        return _assign_brute_force(plan, lights, light_cutoff, clusters)
+    spheres, chunk = lights.spheres(light_cutoff), assign_chunk("groups", plan.batch, plan.branching, plan.pairs)
+    branching = plan.branching or GROUP
+    return assign_coarse_to_fine(spheres, clusters, plan.pairs, chunk, branching, plan.cull, lights.cones)
+
+
+def assign_chunk(walked: Walked, batch: int, branching: int, pairs: int) -> int:
+    """Rows tested at once: (cluster, node) pairs, or words of 32 (cluster, light) pairs."""
+    if walked == "groups":
+        return batch or _WORDS_AT_ONCE.get(jax.default_backend(), 2**22)
+    return walk_chunk(batch, branching if walked == "tree" else WORD_BITS, pairs)
+
+
 def _assign_tree(plan: Plan, tree: LightTree, clusters: Clusters) -> Assigned:
     chunk = walk_chunk(plan.batch, plan.branching, plan.pairs)
     return assign_tree(tree, clusters, plan.pairs, chunk, plan.cull, plan.leaf_test)
@@ -190,6 +262,10 @@ def _morton(plan: Plan, lights: ViewLights, light_cutoff, box):
 
 def _sort(plan: Plan, codes):
     return sort_lights(codes)
+
+
+def _sort_or_keep(plan: Plan, lights: ViewLights, light_cutoff, old_order, frame, resort_every):
+    return order_lights(lights.spheres(light_cutoff), old_order, frame, resort_every)
 
 
 def _build_tree(plan: Plan, lights: ViewLights, light_cutoff, order) -> LightTree:
@@ -215,10 +291,32 @@ def volume_chunk(pairs: int, batch: int) -> int:
     return min(chunk_blocks(pairs, batch), _MAX_VOLUME_RUNS)
 
 
+_PAIRS_AT_ONCE = {"cpu": 2**15, "gpu": 2**20}
+
+
+def _approximate(
+    plan: Plan,
+    gbuffer: GBuffer,
+    lights: ViewLights,
+    light_cutoff,
+    approximate,
+    clusters: Clusters,
+    lists: LightLists,
+) -> tuple[LightLists, ClusterLight]:
+    chunk = min(plan.pairs, _PAIRS_AT_ONCE.get(jax.default_backend(), 2**20))
+    return split_lists(gbuffer, clusters, lists, lights.row, light_cutoff, approximate, chunk)
+
+
 def _shade(
-    plan: Plan, gbuffer: GBuffer, lights: ViewLights, light_cutoff, clusters: Clusters, lists: LightLists
+    plan: Plan,
+    gbuffer: GBuffer,
+    lights: ViewLights,
+    light_cutoff,
+    clusters: Clusters,
+    lists: LightLists,
+    cluster_light: ClusterLight | None = None,
 ) -> Image:
-    return shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch)
+    return shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, cluster_light=cluster_light)
 
 
 def _shade_transparent(
@@ -230,8 +328,9 @@ def _shade_transparent(
     solid: Image,
     clusters: Clusters,
     lists: LightLists,
+    cluster_light: ClusterLight | None = None,
 ) -> Image:
-    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, transparent=True)
+    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, cluster_light=cluster_light)
     return blend_layers(solid, colour, layers)
 
 
@@ -262,7 +361,7 @@ def _shade_transparent_shadowed(
     lists: LightLists,
     shadows: LightShadows,
 ) -> Image:
-    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, shadows)
+    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, shadows=shadows)
     return blend_layers(solid, colour, layers)
 
 
@@ -285,6 +384,11 @@ def _all_lights(lights: ViewLights, clusters: Clusters) -> LightLists:
     return LightLists(zeros, zeros + n_lights, jnp.arange(n_lights), jnp.int32(n_lights), jnp.bool_(False))
 
 
+def _without_tree(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    kept = tuple(stage for stage in stages if stage.name not in ("reduce", "morton", "sort", "build_tree"))
+    return tuple(_ASSIGN_OTHERWISE if stage.name == "assign" else stage for stage in kept)
+
+
 _CLUSTERS = Stage(
     "clusters",
     _clusters,
@@ -294,20 +398,32 @@ _CLUSTERS = Stage(
 _ASSIGN_BRUTE_FORCE = Stage(
     "assign", _assign_brute_force, ("lights", "light_cutoff", "clusters"), ("batch", "pairs", "cull")
 )
+_SORT = Stage("sort", _sort, ("morton",))
+_SORT_OR_KEEP = Stage("sort", _sort_or_keep, ("lights", "light_cutoff", "old_order", "frame", "resort_every"))
+_BUILD_TREE = Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",))
 _ASSIGN_BY_TREE = (
     Stage("reduce", _reduce, ("lights", "light_cutoff")),
     Stage("morton", _morton, ("lights", "light_cutoff", "reduce")),
-    Stage("sort", _sort, ("morton",)),
-    Stage("build_tree", _build_tree, ("lights", "light_cutoff", "sort"), ("branching",)),
+    _SORT,
+    _BUILD_TREE,
     Stage("assign", _assign_tree, ("build_tree", "clusters"), ("branching", "batch", "pairs", "cull", "leaf_test")),
 )
+_ASSIGN_OTHERWISE = Stage(
+    "assign",
+    _assign_otherwise,
+    ("lights", "light_cutoff", "clusters"),
+    ("assigner", "branching", "batch", "pairs", "cull"),
+)
 _LIGHTS = ("lights", "light_cutoff")
+_APPROXIMATE = Stage(
+    "approximate", _approximate, ("gbuffer", *_LIGHTS, "approximate", "clusters", "listed"), ("pairs",)
+)
 _SHADE = (
-    Stage("shade_opaque", _shade, ("gbuffer", *_LIGHTS, "clusters", "assign"), ("batch",)),
+    Stage("shade_opaque", _shade, ("gbuffer", *_LIGHTS, "clusters", "assign", "cluster_light"), ("batch",)),
     Stage(
         "shade_transparent",
         _shade_transparent,
-        ("gbuffer", "layers", *_LIGHTS, "shade_opaque", "clusters", "assign"),
+        ("gbuffer", "layers", *_LIGHTS, "shade_opaque", "clusters", "assign", "cluster_light"),
         ("batch",),
     ),
 )
@@ -359,8 +475,8 @@ def _shadowed(name: str) -> Technique:
     return Technique(name, stages, reads_gbuffer="per_sample")
 
 
-_TILED = (_CLUSTERS, _ASSIGN_BRUTE_FORCE, *_SHADE)
-_CLUSTERED = (_CLUSTERS, *_ASSIGN_BY_TREE, *_SHADE)
+_TILED = (_CLUSTERS, _ASSIGN_BRUTE_FORCE, _APPROXIMATE, *_SHADE)
+_CLUSTERED = (_CLUSTERS, *_ASSIGN_BY_TREE, _APPROXIMATE, *_SHADE)
 
 REGISTRY: dict[str, Technique] = {
     technique.name: technique

@@ -171,18 +171,26 @@ class _EmbreeScene:
 
 
 class _Rays:
-    """The rays of some rows of pixels: slopes `x`, `y`, float64 `[N]`; a depth of 1 along each."""
+    """The rays of some rows of pixels: slopes `x`, `y`, float64 `[N]`; a depth of 1 along each.
+
+    In a parallel projection slopes are where rays start, and all have one direction.
+    """
 
     def __init__(self, camera: Camera, rows: slice):
         self.near_m = camera.near_m
         self.x, self.y = pixel_rays(camera, rows)
         self._right, self._up, self._backward = camera.view_from_world[:3, :3]
         self._eye_m = np.asarray(camera.eye_m, np.float64)
+        self._is_parallel = camera.is_orthographic
 
     def at(self, depth_m: np.ndarray | float, ray: np.ndarray | slice = np.s_[:]) -> tuple[np.ndarray, np.ndarray]:
         """World-space points at a depth on some rays, and the rays' directions: float64 `[N, 3]`."""
-        direction = self.x[ray, None] * self._right + self.y[ray, None] * self._up - self._backward
-        return self._eye_m + np.reshape(depth_m, (-1, 1)) * direction, direction
+        aside, depth_m = self.x[ray, None] * self._right + self.y[ray, None] * self._up, np.reshape(depth_m, (-1, 1))
+        if self._is_parallel:
+            direction = np.broadcast_to(-self._backward, aside.shape)
+            return self._eye_m + aside + depth_m * direction, direction
+        direction = aside - self._backward
+        return self._eye_m + depth_m * direction, direction
 
 
 class Planes:
@@ -198,7 +206,7 @@ class Planes:
         normal = np.cross(v1 - v0, v2 - v0)
         depths = -np.stack([v0[:, 2], v1[:, 2], v2[:, 2]])
         offset = (normal * v0).sum(axis=1)
-        self.scene = scene
+        self.scene, self._camera = scene, camera
         self.row = np.column_stack([normal, offset, depths.min(axis=0), depths.max(axis=0)])
         masked = np.array([m.alpha_mode == "mask" and m.alpha_image is not None for m in scene.materials])
         textured = np.flatnonzero(masked[scene.material_index])
@@ -210,13 +218,17 @@ class Planes:
             self._uv_row = _uv_rows(corners, normal[textured], scene.uv[scene.triangles[textured]].astype(np.float64))
 
     def depth_m(self, triangle: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Distance along -z at which rays `(x, y, -1)` meet the planes of triangles.
+        """Distance along -z at which rays of slopes `x`, `y` meet the planes of triangles.
 
         A plane seen edge-on has no answer, or a far one: the triangle's own range of depths bounds it.
         """
         row = self.row[triangle]
-        along = row[:, 0] * x + row[:, 1] * y - row[:, 2]
-        depth_m = np.divide(row[:, 3], along, out=row[:, 4].copy(), where=along != 0)
+        aside = row[:, 0] * x + row[:, 1] * y
+        if self._camera.is_orthographic:
+            offset, along = aside - row[:, 3], row[:, 2]
+        else:
+            offset, along = row[:, 3], aside - row[:, 2]
+        depth_m = np.divide(offset, along, out=row[:, 4].copy(), where=along != 0)
         return np.clip(depth_m, row[:, 4], row[:, 5])
 
     def is_opaque(self, triangle: np.ndarray, x: np.ndarray, y: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
@@ -232,7 +244,8 @@ class Planes:
                 opaque[here] = material.opacity >= material.alpha_cutoff
                 continue
             row = self._uv_row[self._row_of[triangle[here]]]
-            rx, ry, rz = x[here] * depth_m[here], y[here] * depth_m[here], -depth_m[here]
+            width = self._camera.width_at(depth_m[here])
+            rx, ry, rz = x[here] * width, y[here] * width, -depth_m[here]
             u = row[:, 0] * rx + row[:, 1] * ry + row[:, 2] * rz + row[:, 3]
             v = row[:, 4] * rx + row[:, 5] * ry + row[:, 6] * rz + row[:, 7]
             opaque[here] = material.opacity * _bilinear(material.alpha_image, u, v) >= material.alpha_cutoff
@@ -273,11 +286,7 @@ def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def pixel_rays(camera: Camera, rows: slice) -> tuple[np.ndarray, np.ndarray]:
-    """`x / depth` and `y / depth` of the pixels of some rows, float64 `[rows * w]` each.
-
-    **Raises:** `InputError` for a parallel view.
-    """
-    camera.require_perspective("primary rays")
+    """`x / depth` and `y / depth` of the pixels of some rows (parallel: x and y), float64 `[rows * w]`."""
     x, y = camera.pixel_slopes()
     y = y[rows]
     return np.tile(x, len(y)), np.repeat(y, len(x))

@@ -61,17 +61,16 @@ def in_leaf_nodes(item: Float[Array, " items"], branching: int, absent: float) -
 def build_tree(items: Aabb, branching: int) -> WideTree:
     """Bound the nodes bottom up: one reduction a level."""
     n_items = items.low_x_m.shape[0]
-    lows = [items.low_x_m, items.low_y_m, items.low_z_m]
-    highs = [items.high_x_m, items.high_y_m, items.high_z_m]
+    lows, highs = (items.low_x_m, items.low_y_m, items.low_z_m), (items.high_x_m, items.high_y_m, items.high_z_m)
+    # The greatest is minus the least of what is negated: all six at once.
+    bounds = jnp.stack([*lows, *(-high for high in highs)])
     levels: list[Float[Array, "nodes 6 branching"]] = []
-    lows = [jnp.min(in_leaf_nodes(low, branching, jnp.inf), axis=1) for low in lows]
-    highs = [jnp.max(in_leaf_nodes(high, branching, -jnp.inf), axis=1) for high in highs]
-    for _ in inner_level_nodes(n_items, branching):
-        rows = [in_leaf_nodes(low, branching, jnp.inf) for low in lows]
-        rows += [in_leaf_nodes(high, branching, -jnp.inf) for high in highs]
-        levels.insert(0, jnp.stack(rows, axis=1))
-        lows = [jnp.min(row, axis=1) for row in rows[:3]]
-        highs = [jnp.max(row, axis=1) for row in rows[3:]]
+    for n_nodes in (n_leaf_nodes(n_items, branching), *reversed(inner_level_nodes(n_items, branching))):
+        padding = ((0, 0), (0, n_nodes * branching - bounds.shape[1]))
+        rows = jnp.pad(bounds, padding, constant_values=jnp.inf).reshape(6, n_nodes, branching)
+        levels.insert(0, jnp.concatenate([rows[:3], -rows[3:]]).transpose(1, 0, 2))
+        bounds = jnp.min(rows, axis=2)
+    levels = levels[:-1]  # the leaves' own rows are the items
     children = jnp.concatenate(levels) if levels else jnp.zeros((0, 6, branching))
     return WideTree(children, n_items, branching)
 

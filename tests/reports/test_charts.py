@@ -4,12 +4,12 @@ from typing import Any
 import pytest
 
 from reports.chart_style import chart_html, time_axis
-from reports.charts import beyond_the_chart, speed_against_error, stage_times
+from reports.charts import beyond_the_chart, list_lengths, speed_against_error, stage_times
 from reports.model_charts import predicted_against_measured, time_along_parameters
 from reports.run_folder import read_run_folder
 from tests.reports.synthetic_run import complete_run, run_of_one, run_without_times
 
-CHARTS = [speed_against_error, stage_times, predicted_against_measured, time_along_parameters]
+CHARTS = [speed_against_error, stage_times, predicted_against_measured, time_along_parameters, list_lengths]
 
 
 @pytest.fixture
@@ -78,6 +78,12 @@ def test_the_stages_of_a_technique_stand_beside_its_frame(run):
 def test_a_technique_far_slower_than_the_others_is_named_and_not_drawn(run):
     assert beyond_the_chart(run) == {"forward": 2110.0}
     assert not any("forward" in trace.y[0] for trace in drawn(stage_times, run).data)
+
+
+def test_every_list_stands_in_a_bin_of_its_histogram(run):
+    own = trace(drawn(list_lengths, run), "volume_tiled_bvh")
+    assert list(own.x) == [0, 60, 120] and sum(own.y) == pytest.approx(100)
+    assert "60 to 119 lights: 1,104 lists" in own.hovertext[1]
 
 
 def test_predictions_of_what_was_measured_are_compared(run):

@@ -75,10 +75,13 @@ def test_every_part_is_there(reader):
     ids = {attributes.get("id") for _, attributes in reader.elements}
     assert {"answer", "pictures", "speed", "stages", "model", "counts", "measurements", "provenance"} <= ids
     assert {"speed-against-error", "stage-times", "predicted-against-measured", "time-along-parameters"} <= ids
+    assert "list-lengths" in ids
     for said in (
         "stages need not add up to it",
         "908,412,000",
         "1.87 ns",
+        "dropped at a cap of 64",
+        "77,000",
         "light_cluster_pairs 5.8 %",
         "cpu: AMD EPYC 9654 (2 cores)",
         "vtfs tune --lights 1000 --size 1280x720 --seed 0",
@@ -112,9 +115,9 @@ def test_plotly_is_there_once_and_does_not_end_its_script(page, reader):
 
 def test_every_picture_and_chart_is_described(reader):
     pictures = [a for tag, a in reader.elements if tag == "img" and "src" in a]
-    assert len(pictures) == 3
+    assert len(pictures) == 6
     assert all(a["alt"] for a in pictures)
-    assert sum(a.get("role") == "img" and len(a.get("aria-label", "")) > 20 for _, a in reader.elements) == 5
+    assert sum(a.get("role") == "img" and len(a.get("aria-label", "")) > 20 for _, a in reader.elements) == 6
 
 
 def test_what_files_say_cannot_break_out(tmp_path):

@@ -31,6 +31,11 @@ def test_a_heat_map_is_described_in_words(pictures):
     )
 
 
+def test_cells_come_last_and_say_what_they_show(pictures):
+    assert [picture.kind for picture in pictures][-3:] == ["false_positives", "slices", "clusters"]  # as listed
+    assert pictures[-1].alternative == "The cells that samples lie in. Of clusters."
+
+
 def test_one_scale_reaches_from_zero_to_the_most_of_all_maps(files, pictures):
     scale = heat_scale(pictures, {})
     assert scale is not None

@@ -98,6 +98,10 @@ def test_a_missing_folder_is_named(tmp_path):
         ("\udcff", "damaged"),
         ("[1]", "holds a list"),
         ('{"schema": 2}', "`schema` is 2; this version of vtfs reads 1"),
+        (
+            '{"schema": 1, "list_lengths": [{"technique": 3}]}',
+            r"`list_lengths\[0\]\.technique` is a number; it must be text",
+        ),
         ('{"schema": 1, "best": 3}', "`best` is a number; it must be an object"),
         ('{"schema": 1, "best": {"time_ms": 3}}', r"`best\.technique` is missing"),
         ('{"schema": 1, "best": {"technique": "forward", "time_ms": "3"}}', r"`best\.time_ms` is text"),

@@ -41,8 +41,8 @@ def test_batches_that_hold_the_whole_frame_are_left_out_as_they_equal_zero(n_sam
 
 
 def test_accuracy_settings_are_valid_and_none_is_exact():
-    for gbuffer, cutoff in accuracy_values():
-        assert configuration("forward", {"gbuffer": gbuffer, "light_cutoff": cutoff}) != configuration("forward")
+    for setting in accuracy_values():
+        assert not configuration("tiled_deferred", setting).is_exact
 
 
 @given(

@@ -57,6 +57,15 @@ def test_three_repeats_even_where_all_is_decided(monkeypatch):
     assert np.allclose(seen, [(100.0, 300.0)])  # asked once, with what the three runs say
 
 
+def test_what_is_hopeless_is_not_repeated(monkeypatch):
+    assert len(repeats_ms(FakeClock(monkeypatch, [161.0]).runs[0], never, hopeless_ms=160.0)) == 1
+    assert len(repeats_ms(FakeClock(monkeypatch, [159.0]).runs[0], never, hopeless_ms=160.0)) == 6
+    # One run that something else on the machine held up is none of its own: the second was fast.
+    assert len(repeats_ms(FakeClock(monkeypatch, [61.0, 20.0]).runs[0], never, hopeless_ms=60.0)) >= MIN_REPEATS
+    short = repeats_ms(FakeClock(monkeypatch, [10.0]).runs[0], never, hopeless_ms=1.0)
+    assert sum(short[:-1]) < 1e3 * MIN_S + 1e-6 < sum(short) + 10.0  # as long as any other: a GPU's first ones are slow
+
+
 def test_times_that_disagree_are_repeated_up_to_the_cap(monkeypatch):
     times = repeats_ms(FakeClock(monkeypatch, [10.0, 20.0]).runs[0], never, cap_s=1.0)
     assert sum(times) >= 1000 > sum(times[:-1])

@@ -16,10 +16,10 @@ from tuning.record import read_measurements
 from vtfs.camera import Viewport, save_cameras
 from vtfs.frame import CapacityError, frame_program
 from vtfs.gallery import build_scene
+from vtfs.gbuffer_files import save_gbuffer
 from vtfs.lights import save_lights
 from vtfs.scene import save_scene
 from vtfs.scene_setup import SceneOptions, set_up
-from vtfs.view_samples import save_gbuffer
 
 TECHNIQUES = {"forward", "tiled_deferred", "volume_tiled_bvh"}
 SPACE = "[parameters]\ntile_px = [16, 32]\n"

@@ -46,7 +46,7 @@ def test_a_view_keeps_lengths_and_looks_down_minus_z(eye, yaw, tilt):
 
 def test_directions_have_depth_one_and_row_zero_is_the_top():
     camera = Camera(**GOOD)
-    direction = camera.primary_directions() @ camera.view_from_world[:3, :3].T
+    direction = camera.primary_rays()[1] @ camera.view_from_world[:3, :3].T
     assert direction.shape == (36, 64, 3)
     assert_allclose(direction[..., 2], -1, atol=1e-12)
     # Pixel centres: half a pixel inside the edges of the image.
@@ -105,12 +105,13 @@ def test_a_shifted_image_is_a_part_of_a_larger_one():
     assert up.pixel_slopes()[1].min() > 0  # positive shifts show what is above and to the right
 
 
-def test_a_parallel_view_has_metres_for_slopes_and_no_primary_rays():
+def test_a_parallel_view_has_metres_for_slopes_and_rays_of_one_direction():
     camera = replace(Camera(**GOOD), lens=Lens(orthographic_height_m=9.0))
     x, y = camera.pixel_slopes()
     assert x[0] == pytest.approx(-8 + 0.125) and y[0] == pytest.approx(4.5 - 0.125)
-    with pytest.raises(InputError, match="`orthographic_height_m` = 9: primary rays need a perspective view"):
-        camera.primary_directions()
+    origin, direction = (rays @ camera.view_from_world[:3, :3].T for rays in camera.primary_rays())
+    assert_allclose(direction, np.broadcast_to([0, 0, -1], direction.shape), atol=1e-12)
+    assert_allclose(origin[..., :2] + camera.view_from_world[:2, 3], np.stack(np.meshgrid(x, y), -1), atol=1e-9)
 
 
 def test_lenses_change_keys_but_none_that_was_there_before():

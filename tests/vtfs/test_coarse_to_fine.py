@@ -1,5 +1,7 @@
 """Lists refined from groups to clusters are those of brute force, whatever the boxes, the levels and the chunks."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +16,10 @@ from vtfs.bit_lists import last_not_above_in_order, list_bits, n_bits_set, pack_
 from vtfs.bounds import Aabb
 from vtfs.cluster_grid import cluster_grid, n_cells
 from vtfs.clusters import Clusters, form_clusters
+from vtfs.light_assignment import coarse_to_fine
 from vtfs.light_assignment.brute_force import assign_brute_force
 from vtfs.light_assignment.coarse_to_fine import assign_coarse_to_fine, n_tests
+from vtfs.light_assignment.occupancy import near_any
 from vtfs.light_lists import view_lights
 
 CAPACITY = 2**14
@@ -56,6 +60,44 @@ def test_lists_are_those_of_float64_within_the_slack(n_lights, branching, spread
     for found, needed, allowed in zip(lists_of(lists), must, may, strict=True):
         assert set(np.flatnonzero(needed)) <= set(found) <= set(np.flatnonzero(allowed))
         assert (np.diff(found) > 0).all()  # ascending, so none twice
+
+
+@pytest.fixture
+def lights_are_many(monkeypatch):
+    """From the first light on, those near no cluster are dropped before anything else."""
+    monkeypatch.setattr(coarse_to_fine, "_MANY", 1)
+    return jax.jit(lambda s, c: coarse_to_fine.assign_coarse_to_fine(s, c, CAPACITY, 256, 8)[0])
+
+
+def test_lists_of_many_lights_are_those_of_few(lights_are_many):
+    for spread, seed in itertools.product((0.1, 3.0, 1e5), range(4)):
+        low, high, centre, radius = boxes_and_spheres(200, spread, seed)
+        spheres = as_spheres(centre, radius)
+        for n_clusters in (0, 1, 50):
+            clusters = with_unused(clusters_of(low, high), n_clusters)
+            expected, _ = assign(spheres, clusters, CAPACITY, 256, 8)
+            lists = lights_are_many(spheres, clusters)
+            assert not lists.overflowed
+            assert [a.tolist() for a in lists_of(lists)] == [a.tolist() for a in lists_of(expected)]
+
+
+@pytest.mark.parametrize(("spread", "most_near"), [(0.1, 1.0), (3.0, 0.9), (1e5, 0.5)])
+def test_what_meets_a_box_is_near_and_what_is_far_from_all_is_not(spread, most_near):
+    n_near = 0
+    for seed in range(10):
+        low, high, centre, radius = boxes_and_spheres(200, spread, seed)
+        n_used = 7
+        used, box = jnp.arange(len(low)) < n_used, clusters_of(low, high).box
+        near = np.asarray(near_any_box(as_spheres(centre, radius), box, used))
+        meets = oracles.spheres_in_boxes(centre, radius, low[:n_used], high[:n_used]).any(axis=0)
+        assert not (meets & ~near).any() and not near[np.isinf(centre[:, 0])].any()
+        n_near += near.sum()
+        beyond = np.full_like(centre, high[:n_used].max() + 10)
+        assert not near_any_box(as_spheres(beyond, np.ones_like(radius)), box, used).any()
+    assert n_near <= most_near * 10 * 200
+
+
+near_any_box = jax.jit(near_any)
 
 
 def brute_force_and_refined(camera, tile_px, bounds, kinds, seed):

@@ -92,7 +92,7 @@ def test_layers_of_a_soup_are_those_of_float64_rays(seed):
 
 def ray_hits(scene, camera, row, column):
     """Triangle and depth of all hits of a pixel's ray; None where one is too close to an edge to be sure."""
-    direction = camera.primary_directions()[row, column]
+    direction = camera.primary_rays()[1][row, column]
     hits = []
     for k, corners in enumerate(scene.vertices_m[scene.triangles]):
         e1, e2 = corners[1] - corners[0], corners[2] - corners[0]

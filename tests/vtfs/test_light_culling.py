@@ -19,6 +19,7 @@ from tests.strategies import (
     samples_at,
     seeds,
     surface_samples,
+    through,
 )
 from tests.vtfs.test_light_assignment import listed_lights
 from vtfs.camera import Lens, Viewport
@@ -50,16 +51,6 @@ GRIDS = [
     {"depth_slices": 1, "tile_px": 256},
 ]
 LENSES = [Lens(), Lens(shift_x=0.3, shift_y=-0.7), Lens(orthographic_height_m=7.5)]
-
-
-def through(samples: ViewSamples, lens: Lens) -> ViewSamples:
-    """The same depths seen through another lens."""
-    camera = replace(samples.camera, lens=lens)
-    slope = np.stack(np.meshgrid(*camera.pixel_slopes()), axis=-1)
-    width = 1.0 if camera.is_orthographic else -samples.position_m[..., 2:].astype(np.float64)
-    position_m = samples.position_m.copy()
-    position_m[..., :2] = np.where(samples.valid[..., None], slope * width, 0)
-    return replace(samples, camera=camera, position_m=position_m)
 
 
 def as_spots(samples: ViewSamples, lights: Lights, seed: int) -> Lights:

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests.strategies import seeds
-from vtfs.node_lists import NodeLists, one_list, split
+from vtfs.node_lists import NodeLists, grouped, one_list, pairs_of, split, split_at_once
 
 N_TRIANGLES, N_NODES, BRANCHING, LANES = 100, 5, 4, 8
 CAPACITY_IN = 70
@@ -29,7 +29,7 @@ def packed(lists: list[list[int]]) -> NodeLists:
 
 
 def split_by_tables(lists: NodeLists, goes_on, accepts, drops: bool, capacity: int, chunk: int):
-    """Split where two tables `[triangle, child]` say what happens."""
+    """Split where two tables `[triangle, child]` say what happens; at once where `chunk` is 0."""
     shift = jnp.arange(LANES, dtype=jnp.uint32)
 
     def test(triangle, node):
@@ -41,13 +41,17 @@ def split_by_tables(lists: NodeLists, goes_on, accepts, drops: bool, capacity: i
     def drop(accepted):
         return accepted if drops else jnp.zeros_like(accepted)
 
+    if not chunk:
+        return split_at_once(lists, test, drop, BRANCHING, LANES, N_TRIANGLES, capacity)
     return split(lists, test, drop, BRANCHING, LANES, N_TRIANGLES, capacity, chunk)
 
 
 split_jit = jax.jit(split_by_tables, static_argnums=(3, 4, 5))
 
 
-@pytest.mark.parametrize(("drops", "capacity", "chunk"), [(True, 300, 7), (False, 300, 1000), (True, 300, 1000)])
+@pytest.mark.parametrize(
+    ("drops", "capacity", "chunk"), [(True, 300, 7), (False, 300, 1000), (True, 300, 0), (False, 300, 0)]
+)
 @given(seed=seeds, share=st.sampled_from([0.0, 0.05, 0.5, 1.0]), accepted=st.sampled_from([0.0, 0.02, 1.0]))
 @example(seed=0, share=1.0, accepted=0.0)
 @some
@@ -65,7 +69,7 @@ def test_children_get_what_goes_on_in_order(drops, capacity, chunk, seed, share,
     start, count, triangle = (
         np.asarray(values) for values in (done.lists.start, done.lists.count, done.lists.triangle)
     )
-    n_accepted = n_kept = 0
+    n_accepted = n_kept = n_on = 0
     for child in range(N_NODES * BRANCHING):
         members = lists[child // BRANCHING]
         is_accepted = [t for t in members if accepts[t, child]]
@@ -73,14 +77,16 @@ def test_children_get_what_goes_on_in_order(drops, capacity, chunk, seed, share,
         assert int(done.accepts[child]) == len(is_accepted)
         expected = [] if drops and is_accepted else [t for t in members if goes_on[t, child]]
         n_kept += len(expected)
+        n_on += sum(goes_on[t, child] for t in members)
         row = triangle[start[child] : start[child + 1]].ravel()
         assert count[child] == len(expected) and row[: len(expected)].tolist() == expected
         assert (row[len(expected) :] == N_TRIANGLES).all() and len(row) - len(expected) < LANES
     assert int(done.n_accepted) == n_accepted and int(done.n_refined) == n_kept
+    assert int(done.n_dropped) == n_on - n_kept
     assert int(done.extra) == sum(goes_on[t, c] for c in range(shape[1]) for t in lists[c // BRANCHING])
 
 
-@pytest.mark.parametrize("chunk", [7, 1000])
+@pytest.mark.parametrize("chunk", [7, 0])
 def test_lists_that_do_not_fit_say_so(chunk):
     everything = np.ones((N_TRIANGLES + 1, N_NODES * BRANCHING), bool)
     everything[N_TRIANGLES] = False
@@ -99,3 +105,23 @@ def test_the_roots_list_holds_the_members(members):
         n = int(root.count[0])
         row = np.asarray(root.triangle).ravel()
     assert row[:n].tolist() == members and (row[n:] == N_TRIANGLES).all()
+
+
+@given(seed=seeds, share=st.sampled_from([0.0, 0.3, 1.0]))
+@some
+def test_lists_survive_being_pairs(seed, share):
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(0, N_TRIANGLES + 1, N_NODES)
+    lists = [sorted(rng.choice(N_TRIANGLES, n, replace=False).tolist()) for n in sizes]
+    dropped = rng.random(N_NODES) < share
+    with jax.enable_x64(True):
+        (triangle, node), n = pairs_of(packed(lists), N_TRIANGLES, N_TRIANGLES * N_NODES)
+        back = grouped(triangle, node, n, jnp.asarray(dropped), LANES, N_TRIANGLES, CAPACITY_IN)
+    assert int(n) == sizes.sum()
+    assert [(int(t), int(m)) for t, m in zip(triangle[: int(n)], node[: int(n)], strict=True)] == [
+        (t, m) for m, members in enumerate(lists) for t in members
+    ]
+    expected = packed([[] if drop else members for members, drop in zip(lists, dropped, strict=True)])
+    assert (np.asarray(back.count) == np.asarray(expected.count)).all()
+    assert (np.asarray(back.start) == np.asarray(expected.start)).all()
+    assert (np.asarray(back.triangle) == np.asarray(expected.triangle)).all()

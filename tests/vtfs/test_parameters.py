@@ -19,6 +19,8 @@ OUT_OF_RANGE = {
     "branching": [0, 1, 3, 31, 128, 32.5, -2],
     "batch": [1, 16, 33, -32, 2**25, 1000],
     "light_cutoff": [-0.01, 0.995, 1, 2],
+    "resort_every": [0, -1, 1.5, 65],
+    "approximate": [-0.01, 1.01, 2],
 }
 BAD_NUMBERS = [(name, value) for name, values in OUT_OF_RANGE.items() for value in [*values, *NOT_NUMBERS]]
 WORDS = ("bounds", "gbuffer", "cull", "leaf_test", "unique", "depth_scheme", "normal_cones", "grid")
@@ -74,18 +76,23 @@ def test_defaults_are_those_of_the_design():
     defaults = {name: parameter.default for name, parameter in PARAMETERS.items()}
     assert defaults == {
         "tile_px": 32, "tile_px_x": 0, "tile_px_y": 0, "grid": "off", "depth_slices": 0, "depth_scheme": "self_similar",
-        "branching": 32, "batch": 0, "bounds": "implicit", "cull": "box", "leaf_test": "sphere",
+        "branching": 32, "assigner": "auto", "batch": 0, "bounds": "implicit", "cull": "box", "leaf_test": "sphere",
         "unique": "page_table", "normal_bins": 0, "normal_cones": "implicit", "gbuffer": "float32", "light_cutoff": 0.0,
-        "prepass": "on", "planes": "on", "front_faces": "cast", "feedback": "on", "passes": 1, "level": 0,
-        "tree": "compact", "stencil": "unlimited", "around_eye": "on",
+        "prepass": "on", "approximate": 0.0, "resort_every": 1, "planes": "on", "front_faces": "cast", "feedback": "on",
+        "passes": 1, "level": 0, "tree": "compact", "stencil": "unlimited", "around_eye": "on",
     }  # fmt: skip
     # Tiles had their samples' depths before there was a choice (Olsson and Assarsson 2011).
     own = {(t, n): default_value(t, n) for t, names in TECHNIQUES.items() for n in names}
     assert {key: value for key, value in own.items() if value != defaults[key[1]]} == {
         ("tiled_deferred", "bounds"): "depth_range",
         ("tiled_forward_prez", "bounds"): "depth_range",
-        ("cluster_hierarchy", "bounds"): "explicit",
+        # What tells these apart is how they make their lists.
+        **{
+            (name, "assigner"): "published"
+            for name in ("volume_tiled", "volume_tiled_bvh", "clustered_deferred", "clustered_forward")
+        },
         **{(name, "tile_px"): 8 for name in ("z_pass", "z_fail", "ptsv", "cluster_hierarchy")},
+        ("cluster_hierarchy", "bounds"): "explicit",
     }
 
 

@@ -9,11 +9,11 @@ import pytest
 
 from vtfs.camera import Viewport, save_cameras
 from vtfs.gallery import build_scene
+from vtfs.gbuffer_files import save_gbuffer
 from vtfs.input_error import InputError
 from vtfs.lights import point_lights, save_lights
 from vtfs.scene import save_scene
 from vtfs.scene_setup import DEFAULT_LIGHTS, SceneOptions, set_up
-from vtfs.view_samples import save_gbuffer
 
 SIZE = Viewport(64, 36)
 SMALL = SceneOptions("street", viewport=SIZE, lights="20", n_triangles=1000)

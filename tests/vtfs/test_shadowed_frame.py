@@ -41,7 +41,7 @@ def between(samples: ViewSamples, lights: Lights, seed: int, n: int = 200) -> Ca
 def a_frame(seed: int, suns: DirectionalLights = SUNS, n_lights: int = 3) -> FrameInputs:
     samples = layered_samples(a_camera(), seed)
     lights = nearby_lights(samples, 37, seed)
-    return FrameInputs(samples, lights, ShadowScene(between(samples, lights, seed), suns, n_lights))
+    return FrameInputs(samples, lights, shadow_scene=ShadowScene(between(samples, lights, seed), suns, n_lights))
 
 
 def reference_of(inputs: FrameInputs, lights, technique: str = "brute_force") -> np.ndarray:
@@ -83,7 +83,7 @@ def test_a_shadowed_image_is_the_sum_of_what_each_light_reaches():
     assert largest_relative_difference(image, expected, inputs.seen()) < 1e-4  # as of any image
     reference = reference_of(inputs, lights)
     assert largest_relative_difference(reference, expected, inputs.seen()) < 2e-5  # the far points
-    lit = FrameInputs(inputs.samples, lights, ShadowScene(NOTHING, SUNS, 3))
+    lit = FrameInputs(inputs.samples, lights, shadow_scene=ShadowScene(NOTHING, SUNS, 3))
     unshadowed = render(configuration("brute_force"), lit)
     assert largest_relative_difference(unshadowed, expected, inputs.seen()) > 0.1
 

@@ -9,7 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import oracles
-from tests.strategies import SMALL, WIDE, a_camera, layered_samples, nearby_lights, no_lights, seeds, surface_samples
+from tests.strategies import (
+    SMALL,
+    WIDE,
+    a_camera,
+    layered_samples,
+    nearby_lights,
+    no_lights,
+    seeds,
+    surface_samples,
+    through,
+)
+from vtfs.camera import Lens
 from vtfs.frame import FrameInputs, image_on_host, render, run_stages
 from vtfs.parameters import SHADOW_REFERENCES, TECHNIQUES, configuration
 from vtfs.reference import forward_reference, largest_relative_difference
@@ -117,6 +128,14 @@ def test_stages_by_themselves_make_the_image_of_the_frame(technique):
     assert largest_relative_difference(render(a_config(technique), inputs), by_stages, samples.valid) < 1e-6
 
 
+@pytest.mark.parametrize("technique", ["deferred", "volume_tiled_bvh"])
+def test_a_parallel_view_is_shaded_with_its_eye_at_infinity(technique):
+    samples = through(surface_samples(a_camera(), 7), Lens(orthographic_height_m=7.5))
+    lights = nearby_lights(samples, 37, 7)
+    image = check(a_config(technique), samples, lights)
+    assert largest_relative_difference(image, forward_reference(samples, lights), samples.valid) < 1e-4
+
+
 @pytest.mark.parametrize("technique", ["forward", "volume_tiled_bvh"])
 def test_without_lights_or_samples_there_is_what_emits_or_nothing(technique):
     samples = surface_samples(a_camera(), 5)
@@ -150,6 +169,7 @@ def test_the_registry_and_the_parameters_name_the_same_techniques():
     for name, technique in REGISTRY.items():
         assert technique.name == name and technique.stages[-1].name == "shade_transparent"
         known = {"positions", "gbuffer", "layers", "grid", "normals", "lights", "light_cutoff"}
+        known |= {"approximate", "cluster_light", "listed", "old_order", "frame", "resort_every"}
         if technique.casts_shadows:
             known |= {"shadow_slots", "shadow_merge" if name in SHADOW_REFERENCES else "shadow_tasks"}
         for stage in technique.stages:

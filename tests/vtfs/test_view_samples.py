@@ -1,4 +1,4 @@
-"""View samples against rays tested with every triangle in float64, the cache, and the user's own G-buffer."""
+"""View samples against rays tested with every triangle in float64, and the cache."""
 
 import math
 from dataclasses import replace
@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
-from vtfs.camera import Camera, Viewport, load_cameras
+from vtfs.camera import Camera, Lens, Viewport, load_cameras
 from vtfs.gallery import build_scene
-from vtfs.input_error import InputError
 from vtfs.scene import Material, Scene, load_scene
 from vtfs.tracer import Tracer, _bilinear
-from vtfs.view_samples import load_gbuffer, save_gbuffer, trace_view_samples
+from vtfs.view_samples import trace_view_samples
 
 SHARED = Path(__file__).parents[2].parent / "shared" / "scenes"
 
@@ -32,18 +31,17 @@ def brute_force_hits(scene, camera):
     """Depth and triangle of the nearest surface of each pixel by Moeller-Trumbore, alpha tests by a plain loop."""
     v0, v1, v2 = (scene.vertices_m[scene.triangles[:, k]] for k in range(3))
     e1, e2 = v1 - v0, v2 - v0
-    to_eye = np.array(camera.eye_m) - v0
-    q = np.cross(to_eye, e1)
     height, width = camera.viewport.height_px, camera.viewport.width_px
     depth, seen = np.full((height, width), np.inf), np.full((height, width), -1)
-    directions = camera.primary_directions()
+    origins, directions = camera.primary_rays()
     for row in range(height):
         for column in range(width):
             d = directions[row, column]
-            p = np.cross(d, e2)
+            to_start = origins[row, column] - v0
+            p, q = np.cross(d, e2), np.cross(to_start, e1)
             with np.errstate(all="ignore"):
                 inverse = 1 / (e1 * p).sum(1)
-                u, v, t = (to_eye * p).sum(1) * inverse, q @ d * inverse, (e2 * q).sum(1) * inverse
+                u, v, t = (to_start * p).sum(1) * inverse, q @ d * inverse, (e2 * q).sum(1) * inverse
                 hits = np.flatnonzero((u >= 0) & (v >= 0) & (u + v <= 1) & (t > camera.near_m))
             for k in hits[np.argsort(t[hits])]:
                 material = scene.materials[scene.material_index[k]]
@@ -70,10 +68,17 @@ def oracle_texel(image, u, v):
     )
 
 
-@pytest.mark.parametrize("name", ["atrium", "street", "grove", "conservatory"])
-def test_samples_are_where_rays_meet_all_triangles_in_float64(name):
+@pytest.mark.parametrize(
+    ("name", "lens"),
+    [
+        *((name, Lens()) for name in ("atrium", "street", "grove", "conservatory")),
+        ("grove", Lens(orthographic_height_m=9.0)),
+    ],
+    ids=["atrium", "street", "grove", "conservatory", "parallel"],
+)
+def test_samples_are_where_rays_meet_all_triangles_in_float64(name, lens):
     scene = build_scene(name, 1_500)
-    camera = frame(scene, 40, 22, 7)
+    camera = replace(frame(scene, 40, 22, 7), lens=lens)
     samples = trace_view_samples(scene, camera)
     depth, seen = brute_force_hits(scene, camera)
     same = samples.triangle == seen
@@ -85,12 +90,12 @@ def test_samples_are_where_rays_meet_all_triangles_in_float64(name):
     # Everything lies on the ray of its pixel, whatever triangle it is on.
     x, y = camera.pixel_slopes()
     lies = samples.valid
-    assert_allclose(samples.position_m[..., 0][lies], (x * -samples.position_m[..., 2])[lies], rtol=1e-6, atol=1e-7)
-    assert_allclose(
-        samples.position_m[..., 1][lies], (y[:, None] * -samples.position_m[..., 2])[lies], rtol=1e-6, atol=1e-7
-    )
+    width = np.ones_like(samples.specular) if camera.is_orthographic else -samples.position_m[..., 2]
+    assert_allclose(samples.position_m[..., 0][lies], (x * width)[lies], rtol=1e-6, atol=1e-7)
+    assert_allclose(samples.position_m[..., 1][lies], (y[:, None] * width)[lies], rtol=1e-6, atol=1e-7)
     assert_allclose(np.linalg.norm(samples.normal[lies], axis=-1), 1, rtol=1e-6)
-    assert ((samples.normal * samples.position_m).sum(-1)[lies] <= 1e-6).all()  # facing the eye
+    ray = np.array([0.0, 0.0, -1.0]) if camera.is_orthographic else samples.position_m
+    assert ((samples.normal * ray).sum(-1)[lies] <= 1e-6).all()  # facing the eye
     colour = np.array([scene.materials[m].base_colour for m in scene.material_index[samples.triangle[lies]]])
     assert_allclose(samples.base_colour[lies], colour, rtol=1e-6)
     assert (samples.position_m[samples.triangle < 0] == 0).all() and not samples.valid[samples.triangle < 0].any()
@@ -209,91 +214,6 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("VTFS_CACHE_DIR", str(tmp_path / "file"))
     assert trace_view_samples(stacked(square(5, SOLID)), FRONT).valid.all()
-
-
-def test_a_gbuffer_survives_its_file(tmp_path):
-    scene = build_scene("street", 1_500)
-    samples = trace_view_samples(scene, frame(scene, 64, 36, 0))
-    save_gbuffer(tmp_path / "g.npz", samples)
-    again = load_gbuffer(tmp_path / "g.npz", samples.camera)
-    assert_array_equal(again.valid, samples.valid)
-    assert_array_equal(again.triangle[samples.valid], samples.triangle[samples.valid])
-    assert_allclose(again.position_m[samples.valid], samples.position_m[samples.valid], rtol=1e-6)
-    assert_allclose(again.normal, samples.normal * samples.valid[..., None], atol=1e-6)
-
-
-def gbuffer(**changes):
-    shape = (16, 16)
-    arrays = {
-        "depth": np.full(shape, 5.0, np.float32),
-        "normal": np.tile(np.array([0, 0, 1], np.float32), (*shape, 1)),
-        "base_colour": np.full((*shape, 3), 0.5, np.float32),
-    }
-    return {key: value for key, value in (arrays | changes).items() if value is not None}
-
-
-def test_depth_and_a_layer_axis_are_enough(tmp_path):
-    np.savez(tmp_path / "g.npz", **{key: value[None] for key, value in gbuffer().items()})
-    samples = load_gbuffer(tmp_path / "g.npz", FRONT)
-    expected = trace_view_samples(stacked(square(5, SOLID)), FRONT)
-    assert_allclose(samples.position_m, expected.position_m, rtol=1e-6)
-    assert samples.valid.all() and (samples.shininess == 32).all()
-
-
-def shifted():
-    x, y = FRONT.pixel_slopes()
-    position = np.stack(
-        [np.broadcast_to(x * 5, (16, 16)), np.broadcast_to(y[:, None] * 5, (16, 16)), np.full((16, 16), -5.0)], -1
-    )
-    position[3, 4, 0] += 5 * (x[1] - x[0])
-    return position
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"normal": None}, "key `normal`: is missing"),
-        ({"depth": None}, "key `position` or `depth`: is missing"),
-        ({"depth": np.ones((8, 8))}, r"key `depth`: has shape \(8, 8\)"),
-        ({"depth": np.ones((2, 16, 16))}, "key `depth`: has shape"),
-        ({"depth": np.ones((16, 16), int)}, "key `depth`: has dtype int64; must be floats"),
-        ({"valid": np.ones((16, 16))}, "key `valid`: has dtype float64; must be booleans"),
-        ({"primitive": np.ones((16, 16))}, "key `primitive`: has dtype float64"),
-        ({"normal": np.zeros((16, 16, 3))}, "key `normal` at row 0, column 0: has length 0"),
-        ({"base_colour": np.full((16, 16, 3), -1.0)}, "key `base_colour` at row 0.*0 or more"),
-        ({"specular": np.full((16, 16), np.nan)}, "key `specular` at row 0.*finite"),
-        ({"position": shifted()}, "key `position` at row 3, column 4: projects 1 pixels"),
-        ({"depth": np.array([{}] * 256).reshape(16, 16)}, "dtype object"),
-    ],
-)
-def test_a_wrong_gbuffer_is_refused_by_key(tmp_path, changes, message):
-    np.savez(tmp_path / "g.npz", **gbuffer(**changes))
-    with pytest.raises(InputError, match=message) as caught:
-        load_gbuffer(tmp_path / "g.npz", FRONT)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"no archive at all"])
-def test_what_is_no_gbuffer_is_refused(tmp_path, content):
-    (tmp_path / "g.npz").write_bytes(content)
-    with pytest.raises(InputError, match=r"is not an \.npz"):
-        load_gbuffer(tmp_path / "g.npz", FRONT)
-    with pytest.raises(InputError, match="no such file"):
-        load_gbuffer(tmp_path / "none.npz", FRONT)
-
-
-def test_damaged_gbuffers_are_refused_or_read(tmp_path):
-    np.savez(tmp_path / "g.npz", **gbuffer())
-    good = (tmp_path / "g.npz").read_bytes()
-    rng = np.random.default_rng(0)
-    for _ in range(150):
-        bad = bytearray(good)
-        bad[rng.integers(len(bad))] ^= 1 << rng.integers(8)
-        (tmp_path / "b.npz").write_bytes(bad[: rng.integers(1, len(bad) + 1)] if rng.random() < 0.5 else bad)
-        try:
-            load_gbuffer(tmp_path / "b.npz", FRONT)
-        except InputError as error:
-            assert "\n" not in str(error)
 
 
 @pytest.mark.shared

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vtfs.bit_lists import WORD_BITS, gather_hits
 from vtfs.bounds import Cone, Sphere
@@ -43,3 +44,10 @@ def assign_brute_force(
     lists = lists_from_pairs(cluster, light, total, (total > capacity) | too_many, clusters.key.shape[0])
     none = jnp.zeros(0, jnp.int32)
     return lists, AssignCounts(none, none, n_rows, clusters.n_clusters)
+
+
+def every_pair(n_clusters: int, n_lights: int) -> AssignCounts:
+    """The counts of testing all pairs, without testing them; host integers."""
+    none = np.zeros(0, np.int64)
+    rows, short_rows = np.int64(n_clusters) * n_leaf_nodes(n_lights, WORD_BITS), np.int64(n_clusters)
+    return AssignCounts(none, none, rows, short_rows)  # type: ignore[arg-type]  # as on the device

@@ -7,24 +7,31 @@ reduction a level, of clusters that are few, instead of codes, a sort and boxes 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from vtfs.bit_lists import WORD_BITS, last_not_above, list_bits, pack_bits, starts_of
-from vtfs.bounds import Aabb, Sphere, sphere_meets_box
+from vtfs.bounds import Aabb, Cone, Sphere, sphere_meets_box
 from vtfs.clusters import Clusters
+from vtfs.light_assignment.occupancy import list_near_any
+from vtfs.light_culling import Cull, may_reach
 from vtfs.light_lists import AssignCounts, LightLists
-from vtfs.wide_tree import build_tree, in_leaf_nodes, n_leaf_nodes
+from vtfs.wide_tree import n_leaf_nodes
+
+GROUP = 32
+"""Clusters of a group, where nothing says otherwise."""
 
 _WHOLE = 2**21
 """Words of a level that are tested in one step on a GPU, whatever the chunk."""
 
 
-_COARSE_SHARE = 4
-"""Groups have fewer entries than clusters, and fresh memory is what a CPU spends most on with few lights."""
+_MANY = 2**18
+"""From so many lights on, those near no cluster are dropped first."""
 
 
 class NodeLists(eqx.Module):
@@ -47,13 +54,23 @@ class Blocks(eqx.Module):
     total: Int[Array, ""]
 
 
+Keep = Callable[[Int[Array, " rows"], Sphere, Cone | None], Bool[Array, "rows 32"]]
+
+
 def assign_coarse_to_fine(
-    lights: Sphere, clusters: Clusters, capacity: int, chunk: int, branching: int = 32
+    lights: Sphere,
+    clusters: Clusters,
+    capacity: int,
+    chunk: int,
+    branching: int = GROUP,
+    cull: Cull = "box",
+    cones: Cone | None = None,
 ) -> tuple[LightLists, AssignCounts]:
     """Refine the list of all lights to lists of groups of `branching` consecutive clusters, and those to clusters.
 
     Clusters are in order of their keys, so that a group is a piece of a row of tiles. Any boxes will do. Lights are
-    listed in ascending order.
+    listed in ascending order. Groups are tested by their boxes, so that `cull` must be one that lets no light pass
+    whose sphere misses the cluster's box: `box` or `frustum`.
 
     **Arguments:**
 
@@ -68,30 +85,45 @@ def assign_coarse_to_fine(
     levels = cluster_levels(clusters, branching)
     n_lights = lights.x_m.shape[0]
     n_words = n_leaf_nodes(n_lights, WORD_BITS)
-    everyone = jnp.arange(n_words * WORD_BITS, dtype=jnp.int32)
-    lists = NodeLists(everyone, jnp.zeros(1, jnp.int32), jnp.full(1, n_lights, jnp.int32))
-    # Places past the lights are read by lanes that are masked.
-    lights = jax.tree.map(lambda column: jnp.pad(column, (0, n_words * WORD_BITS - n_lights)), lights)
-
+    rooms = _rooms(capacity, n_lights, len(levels))
     overflowed, words, absent, held = jnp.bool_(False), [], [], n_words * WORD_BITS
+    # Places past the lights are read by lanes that are masked.
+    lights, cones = jax.tree.map(lambda column: jnp.pad(column, (0, held - n_lights)), (lights, cones))
+    near, n_near = None, jnp.int32(n_lights)
+    if n_lights >= _MANY:
+        held = rooms[0]
+        near, n_near = list_near_any(lights, n_lights, clusters.box, _used(clusters), held)
+        overflowed = n_near > held
+        # Their columns are so few that a GPU's cache holds them, wherever in the lists they are read.
+        lights, cones = jax.tree.map(lambda column: column[near], (lights, cones))
+    lists = NodeLists(jnp.arange(held, dtype=jnp.int32), jnp.zeros(1, jnp.int32), n_near[None])
+    culls_more = cull != "box" or cones is not None or clusters.cones is not None
+
+    def keep(cluster, sphere, cone):
+        return may_reach(sphere, cone, clusters, cluster, cull, "sphere")
+
     for depth, boxes in enumerate(levels):
         n_below = branching ** (len(levels) - 1 - depth)
-        n_children = _n_children(-(-clusters.n_clusters // n_below), boxes.shape[0], branching)
+        n_children = _n_children(-(-clusters.n_clusters // n_below), *boxes.shape[1:])
         # A list that is not whole is not refined.
-        count = jnp.where(overflowed | (n_children == 0), 0, lists.count[: boxes.shape[0]])
-        lists = NodeLists(lists.light, lists.offset[: boxes.shape[0]], count)
+        count = jnp.where(overflowed | (n_children == 0), 0, lists.count[: boxes.shape[1]])
+        lists = NodeLists(lists.light, lists.offset[: boxes.shape[1]], count)
         first, total = starts_of(-(-count // WORD_BITS))
         blocks = Blocks(first, -(-count // WORD_BITS), total)
         words.append(jnp.sum(n_children * blocks.count, dtype=jnp.int32))
         absent.append(jnp.sum(n_children * (blocks.count * WORD_BITS - count), dtype=jnp.int32))
-        room = capacity if depth == len(levels) - 1 else max(capacity // _COARSE_SHARE, WORD_BITS)
-        most_blocks = held // WORD_BITS + boxes.shape[0]
-        lists, total = refine(lights, lists, blocks, boxes, most_blocks, room, chunk)
+        room = rooms[depth + 1]
+        most_blocks = held // WORD_BITS + boxes.shape[1]
+        if depth == len(levels) - 1 and culls_more:
+            lists, total = refine(lights, lists, blocks, boxes, most_blocks, room, chunk, cones, keep)
+        else:
+            lists, total = refine(lights, lists, blocks, boxes, most_blocks, room, chunk)
         overflowed |= total > room
         held = room
     n = clusters.key.shape[0]
+    index = lists.light if near is None else near[lists.light]
     counts = AssignCounts(_stack(words[:-1]), _stack(absent[:-1]), words[-1], absent[-1])
-    return LightLists(lists.offset[:n], lists.count[:n], lists.light, total, overflowed), counts
+    return LightLists(lists.offset[:n], lists.count[:n], index, total, overflowed), counts
 
 
 def n_tests(counts: AssignCounts) -> tuple[int, int]:
@@ -101,40 +133,69 @@ def n_tests(counts: AssignCounts) -> tuple[int, int]:
     return coarse, int(counts.leaf_rows) * WORD_BITS - int(counts.short_leaf_rows)
 
 
-def cluster_levels(clusters: Clusters, branching: int) -> list[Float[Array, "nodes 6 branching"]]:
-    """Boxes of the children of each node, one row a node, level by level from the root; the last are the clusters'.
+def _rooms(capacity: int, n_lights: int, n_levels: int) -> tuple[int, ...]:
+    """Places for the lights that are near any cluster, and for the lists of each level; the last are the clusters'.
 
-    Children that are absent have empty boxes.
+    Room costs: fresh memory on a CPU, and work on a GPU, which lists all places at once. Few lights are in fewer lists
+    of groups than of clusters. Of many, each that is near a cluster is in some group of a thousand, and half of those
+    in several groups of 32: `benchmarks/light_assignment.py` prints the tests. A capacity that grows makes all grow.
     """
-    used = jnp.arange(clusters.key.shape[0]) < clusters.n_clusters
-    box = clusters.box
-    lows = [jnp.where(used, low, jnp.inf) for low in (box.low_x_m, box.low_y_m, box.low_z_m)]
-    highs = [jnp.where(used, high, -jnp.inf) for high in (box.high_x_m, box.high_y_m, box.high_z_m)]
-    tree = build_tree(Aabb(*lows, *highs), branching)
-    rows = [in_leaf_nodes(low, branching, jnp.inf) for low in lows]
-    rows += [in_leaf_nodes(high, branching, -jnp.inf) for high in highs]
-    ends = np.cumsum(tree.level_nodes)
-    inner = [tree.children[end - n : end] for end, n in zip(ends, tree.level_nodes, strict=True)]
-    return [*inner, jnp.stack(rows, axis=1)]
+    if n_lights < _MANY:
+        first, coarse, last_coarse = n_lights, capacity // 4 + 3 * n_lights // 4, capacity // 4 + 3 * n_lights // 2
+    else:
+        first = coarse = (capacity + n_lights) // 8
+        last_coarse = (capacity + n_lights) // 2
+    rooms = [first, *[coarse] * (n_levels - 2), *[last_coarse] * (n_levels > 1)]
+    return (*(-(-room // WORD_BITS) * WORD_BITS for room in rooms), capacity)
+
+
+def _used(clusters: Clusters) -> Bool[Array, " clusters"]:
+    return jnp.arange(clusters.key.shape[0]) < clusters.n_clusters
+
+
+def cluster_levels(clusters: Clusters, branching: int) -> list[Float[Array, "6 nodes branching"]]:
+    """Boxes of the children of each node, level by level from the root; the last are the clusters'.
+
+    Lower bounds and negated upper ones, so that one reduction makes a level. Children that are absent have empty boxes.
+    """
+    used, box = _used(clusters), clusters.box
+    bounds = jnp.stack([box.low_x_m, box.low_y_m, box.low_z_m, -box.high_x_m, -box.high_y_m, -box.high_z_m])
+    bounds = jnp.where(used, bounds, jnp.inf)
+    levels: list[Float[Array, "6 nodes branching"]] = []
+    while True:
+        n_nodes = n_leaf_nodes(bounds.shape[1], branching)
+        # All lights are tested against every child of the root: it has no absent ones.
+        width = branching if n_nodes > 1 else bounds.shape[1]
+        padded = jnp.pad(bounds, ((0, 0), (0, n_nodes * width - bounds.shape[1])), constant_values=jnp.inf)
+        levels.insert(0, padded.reshape(6, n_nodes, width))
+        if n_nodes == 1:
+            return levels
+        bounds = jnp.min(levels[0], axis=2)
 
 
 def refine(
     lights: Sphere,
     lists: NodeLists,
     blocks: Blocks,
-    boxes: Float[Array, "nodes 6 branching"],
+    boxes: Float[Array, "6 nodes branching"],
     most_blocks: int,
     capacity: int,
     chunk: int,
+    cones: Cone | None = None,
+    keep: Keep | None = None,
 ) -> tuple[NodeLists, Int[Array, ""]]:
     """Lists of the children from those of their parents.
 
     Lights are loaded once for all children of a node: loading costs a CPU more than testing.
 
+    **Arguments:**
+
+    - `keep`: a further test of each child (numbered through all nodes) against 32 lights that meet its box.
+
     **Returns:** the children's lists, and their total length, also where it is more than `capacity`.
     """
     branching = boxes.shape[2]
-    hits = _test_blocks(lights, lists, blocks, boxes, most_blocks, chunk)
+    hits = _test_blocks(lights, lists, blocks, boxes, most_blocks, chunk, cones, keep)
 
     def words_of(row):
         """Row after row: the children of a node, the blocks of a child."""
@@ -165,9 +226,11 @@ def _test_blocks(
     lights: Sphere,
     lists: NodeLists,
     blocks: Blocks,
-    boxes: Float[Array, "nodes 6 branching"],
+    boxes: Float[Array, "6 nodes branching"],
     most_blocks: int,
     chunk: int,
+    cones: Cone | None,
+    keep: Keep | None,
 ) -> UInt32[Array, "blocks branching"]:
     """Which lights of each block meet each child of its node: bit `l` for the `l`-th light."""
     branching = boxes.shape[2]
@@ -180,12 +243,16 @@ def _test_blocks(
         light = lists.light[jnp.where(there, (lists.offset[node] + before)[:, None] + lane, 0)]
         light = jnp.where(there, light, 0)
         # Loaded before, not within, the tests: a GPU would load each light again for every child.
-        sphere = jax.lax.optimization_barrier(jax.tree.map(lambda column: column[light], lights))
-        sphere = jax.tree.map(lambda column: column[:, None, :], sphere)
-        box = boxes[node]
-        return pack_bits(
-            there[:, None, :] & sphere_meets_box(sphere, Aabb(*(box[:, c, :, None] for c in range(6))))
-        ).reshape(-1, branching)
+        sphere, cone = jax.lax.optimization_barrier(jax.tree.map(lambda column: column[light], (lights, cones)))
+        low, high = boxes[:3, node, :, None], -boxes[3:, node, :, None]
+        in_row = jax.tree.map(lambda column: column[:, None, :], sphere)
+        meets = there[:, None, :] & sphere_meets_box(in_row, Aabb(*low, *high))
+        if keep is not None:
+            # One row a child, as `may_reach` has them.
+            of_child = jax.tree.map(lambda column: jnp.repeat(column, branching, axis=0), (sphere, cone))
+            child = node[:, None] * branching + jnp.arange(branching)
+            meets &= keep(child.reshape(-1), *of_child).reshape(meets.shape)
+        return pack_bits(meets).reshape(-1, branching)
 
     if jax.default_backend() != "cpu" and most_blocks * branching <= max(chunk, _WHOLE):
         return test(jnp.arange(most_blocks, dtype=jnp.int32))

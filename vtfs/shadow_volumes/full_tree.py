@@ -23,8 +23,8 @@ def n_cells(columns: int, rows: int, slices: int, branching: int) -> int:
     n_bytes = n_tree_bytes(cells, branching)
     if n_bytes > MOST_BYTES:
         raise InputError(
-            f"tree=full: {columns} x {rows} x {slices} cells have {cells:,} places and take {n_bytes / 2**20:,.0f} MiB, "
-            f"more than {MOST_BYTES // 2**20}; use tree=compact, larger tiles or fewer slices."
+            f"tree=full: {columns} x {rows} x {slices} cells have {cells:,} places and take {n_bytes >> 20:,} MiB, "
+            f"more than {MOST_BYTES >> 20}; use tree=compact, larger tiles or fewer slices."
         )
     return cells
 

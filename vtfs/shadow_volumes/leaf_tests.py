@@ -28,7 +28,7 @@ def held_samples(
         n_pairs = lists.triangle.shape[1] * rows.shape[2]
         chunk = max(1, _SAMPLES_AT_ONCE.get(jax.default_backend(), 2**26) // n_pairs)
         bits = _tested_in_chunks(lists, volume, hierarchy, rows, chunk)
-    return _merged(bits, lists.start, hierarchy.tile_of_item.shape[0])
+    return _merged(bits, lists, hierarchy.tile_of_item.shape[0])
 
 
 def _sample_rows(hierarchy: Hierarchy, volume: Volumes) -> Float[Array, "tiles 4 lanes"]:
@@ -46,8 +46,7 @@ def _tested_at_once(lists: NodeLists, volume: Volumes, hierarchy: Hierarchy, row
     capacity = lists.triangle.shape[0]
     n_samples = rows.shape[2]
     words = max(1, n_samples // 32)
-    item = last_not_above(lists.start, jnp.arange(capacity, dtype=jnp.int32))
-    tile = hierarchy.tile_of_item[jnp.minimum(item, hierarchy.tile_of_item.shape[0] - 1)]
+    tile = hierarchy.tile_of_item[jnp.minimum(lists.nodes(), hierarchy.tile_of_item.shape[0] - 1)]
     row = rows.at[tile].get(mode="promise_in_bounds").reshape(capacity, 4, words, 1, n_samples // words)
     position = tuple(row[:, c].astype(jnp.float64) - volume.origin_m[c] for c in range(3))
     planes = jax.tree.map(lambda c: c[:, None, :, None], volume.edges.at(lists.triangle))
@@ -89,14 +88,13 @@ def _tested_in_chunks(
     return bits
 
 
-def _merged(
-    bits: UInt32[Array, "groups words"], start: Int[Array, " items_and_1"], n_items: int
-) -> UInt32[Array, "items words"]:
+def _merged(bits: UInt32[Array, "groups words"], lists: NodeLists, n_items: int) -> UInt32[Array, "items words"]:
     """All bits of the groups of each item, which are consecutive: in each step a group takes in twice as many."""
-    capacity = bits.shape[0]
+    start, capacity = lists.start, lists.triangle.shape[0]
+    bits = bits[:capacity]
     longest = jnp.max(start[1:] - start[:-1])
     group = jnp.arange(capacity, dtype=jnp.int32)
-    end = start[jnp.minimum(last_not_above(start, group), start.shape[0] - 2) + 1]
+    end = start[lists.nodes() + 1]
 
     def double(bits, step):
         other = group + step

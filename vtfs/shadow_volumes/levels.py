@@ -5,9 +5,8 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, UInt32
+from jaxtyping import Array, Bool, Int
 
-from vtfs.bit_lists import last_not_above
 from vtfs.node_lists import NodeLists, Split, split, split_at_once
 from vtfs.shadow_mask import ShadowPlan
 from vtfs.shadow_volumes.hierarchy import Hierarchy
@@ -22,9 +21,6 @@ LEAF_LANES = 4
 
 _TRIANGLES_AT_ONCE = {"cpu": 2**15}
 """Triangles listed in one chunk of a loop: what stays in the caches of a CPU. Elsewhere a step of a loop costs more."""
-
-_CHILDREN_AT_ONCE = 8
-"""Children that one thread of a GPU tests: a triangle's planes are loaded once for them."""
 
 
 class LevelCounts(eqx.Module):
@@ -88,7 +84,7 @@ def descend(at: AtLevel, first: int, last: int, volume: Volumes, hierarchy: Hier
     n_inner = len(levels) - 1
 
     def visit(at: AtLevel, level, n_parents: int, n_kept: int, lanes: int, capacity: int) -> AtLevel:
-        lists = NodeLists(at.lists.triangle, at.lists.start[: n_parents + 1], at.lists.count[:n_parents])
+        lists = at.lists.of_first(n_parents)
         n_children = n_parents * b
         offset = jnp.asarray(table.first_child)[level]
         was = jax.lax.dynamic_slice_in_dim(at.shadowed, offset, n_children)
@@ -106,8 +102,7 @@ def descend(at: AtLevel, first: int, last: int, volume: Volumes, hierarchy: Hier
         shadowed = jax.lax.dynamic_update_slice_in_dim(at.shadowed, jnp.where(own, now, was), offset, 0)
         cover = jnp.repeat(at.cover[:n_parents], b, total_repeat_length=n_children) + done.accepts
         counts = _with_level(at.counts, lists, done, level, hierarchy, plan)
-        kept = NodeLists(done.lists.triangle, done.lists.start[: n_kept + 1], done.lists.count[:n_kept])
-        return AtLevel(kept, (now & own)[:n_kept], cover[:n_kept], shadowed, counts)
+        return AtLevel(done.lists.of_first(n_kept), (now & own)[:n_kept], cover[:n_kept], shadowed, counts)
 
     if at_once:
         for level in range(first, min(last, n_inner)):
@@ -170,32 +165,31 @@ def _split_level(
         extra = jnp.where(only, 0, jnp.sum(refined, dtype=jnp.int32))
         return both & jnp.uint32(2**LANES - 1), both >> LANES, extra
 
-    def by_triangles(triangle, node):
-        """Some children of one triangle after the other: a thread of a GPU loads its planes once."""
-        width = min(b, _CHILDREN_AT_ONCE)
-        row = rows_of(node).reshape(node.shape[0], 6, b // width, width)
-        planes = jax.tree.map(lambda c: c[:, None, :], volume.nodes.at(triangle))
-        both = n_refined = jnp.uint32(0)
-        for child in range(width):
-            boxes = tuple(row[:, c, :, child, None] for c in range(6))
-            refined, goes_on, accepted = test_nodes(planes, boxes, hierarchy.is_frustum, bias_m)
-            both = both | (goes_on.astype(jnp.uint32) << child) | (accepted.astype(jnp.uint32) << (child + width))
-            n_refined = n_refined + refined.astype(jnp.uint32)
-        first = jnp.arange(b // width, dtype=jnp.int32)[:, None] == 0
-        both = jnp.where(only, (first & (triangle != absent)[:, None, :]).astype(jnp.uint32), both)
-        # Not fused into what reads it, which would test again for every child.
-        both = jax.lax.optimization_barrier(both)
-        extra = jnp.where(only, 0, jnp.sum(n_refined, dtype=jnp.int32))
-
-        def of_children(words: UInt32[Array, "groups blocks lanes"]) -> UInt32[Array, "groups branching"]:
-            child, lane = jnp.arange(width, dtype=jnp.uint32)[:, None], jnp.arange(LANES, dtype=jnp.uint32)
-            bits = (words[:, :, None, :] >> child & 1) << lane
-            return jnp.sum(bits, axis=-1, dtype=jnp.uint32).reshape(-1, b)
-
-        return of_children(both), of_children(both >> width), extra
+    def by_children(triangle, node):
+        """All children of a triangle side by side: threads of a GPU that load the same planes, one after another in
+        the boxes."""
+        width = min(b, 32)
+        row = rows_of(node)
+        planes = jax.tree.map(lambda c: c[:, :, None], volume.nodes.at(triangle))
+        boxes = tuple(row[:, c, None, :] for c in range(6))
+        refined, goes_on, accepted = test_nodes(planes, boxes, hierarchy.is_frustum, bias_m)
+        pass_on = jnp.zeros((1, 1, b), bool).at[..., 0].set(True) & (triangle != absent)[:, :, None]
+        goes_on, accepted = jnp.where(only, pass_on, goes_on), accepted & ~only
+        child = jnp.arange(b, dtype=jnp.uint64) % width
+        both = (goes_on.astype(jnp.uint64) << child) | (accepted.astype(jnp.uint64) << (child + 32))
+        both = both.reshape(*both.shape[:2], b // width, width)
+        both = jax.lax.reduce(both, jnp.uint64(0), jax.lax.bitwise_or, (3,))
+        # From bits of children, by triangle, to bits of triangles, by child.
+        bit = jnp.arange(width, dtype=jnp.uint64)[:, None]
+        lane = jnp.arange(LANES, dtype=jnp.uint32)
+        words = both.transpose(0, 2, 1)[:, :, None, :] >> bit
+        bits = (words & 1).astype(jnp.uint32) << lane | (words >> 32 & 1).astype(jnp.uint32) << (lane + LANES)
+        both = jnp.sum(bits, axis=-1, dtype=jnp.uint32).reshape(-1, b)
+        extra = jnp.where(only, 0, jnp.sum(refined, dtype=jnp.int32))
+        return both & jnp.uint32(2**LANES - 1), both >> LANES, extra
 
     if plan.level_groups:
-        return split_at_once(lists, by_triangles, drop, b, lanes, absent, capacity)
+        return split_at_once(lists, by_children, drop, b, lanes, absent, capacity)
     return split(lists, by_lanes, drop, b, lanes, absent, capacity, chunk)
 
 
@@ -210,9 +204,8 @@ def _with_level(
     tests = jnp.where(only, 0, jnp.sum(lists.count.astype(jnp.int64) * children, dtype=jnp.int64))
     extra = jnp.where(plan.extra != "off", done.extra, 0)
     n_groups = lists.triangle.shape[0]
-    group = jnp.arange(n_groups, dtype=jnp.int32)
-    node = jnp.minimum(last_not_above(lists.start, group), n_rows - 1)
-    each = jnp.where((group < lists.n_groups) & ~only, children[node], 0)
+    is_used = jnp.arange(n_groups, dtype=jnp.int32) < lists.n_groups
+    each = jnp.where(is_used & ~only, children[lists.nodes()], 0)
     return LevelCounts(
         counts.node_tests.at[level].add(tests),
         counts.accepted.at[level].add(done.n_accepted),

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
-from vtfs.bit_lists import last_not_above, n_bits_set
+from vtfs.bit_lists import n_bits_set
 from vtfs.input_error import InputError
-from vtfs.node_lists import grouped, one_list, pairs_of
+from vtfs.node_lists import NodeLists, grouped, one_list, pairs_of
 from vtfs.shadow_mask import ShadowPlan
 from vtfs.shadow_volumes.hierarchy import Hierarchy, merged_up
 from vtfs.shadow_volumes.leaf_tests import held_counts, held_samples
@@ -44,8 +47,6 @@ def restart_level(plan: ShadowPlan, n_levels: int) -> int:
 
     **Raises:** `InputError` where the tree has no such level.
     """
-    if plan.passes not in (1, 2):
-        raise InputError(f"passes={plan.passes}: must be 1 or 2.")
     if n_levels < 2:
         raise InputError(f"passes=2: the tree has one level with branching={plan.branching}; use passes=1.")
     level = plan.level or n_levels // 2
@@ -66,82 +67,103 @@ def walk_volumes(volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> Wal
     Sec. 4.2): pairs of batches that were walked before a node was found in shadow are dropped there too.
     """
     n_triangles, n_levels = volume.safe.shape[0], len(hierarchy.table.level_nodes)
-    two_passes = plan.passes != 1
-    middle = restart_level(plan, n_levels) if two_passes else n_levels
-    batch = plan.batch if 0 < plan.batch < n_triangles else n_triangles
-    n_batches = -(-n_triangles // batch)
+    size = plan.batch if 0 < plan.batch < n_triangles else n_triangles
+    n_batches = -(-n_triangles // size)
     in_order = jnp.arange(n_triangles, dtype=jnp.int32)
     if plan.feedback and n_batches > 1:
         in_order = jnp.argsort(-volume.solid_angle).astype(jnp.int32)
-    triangle = jnp.pad(in_order, (0, n_batches * batch - n_triangles), constant_values=n_triangles)
+    triangle = jnp.pad(in_order, (0, n_batches * size - n_triangles), constant_values=n_triangles)
     casts = jnp.append(volume.safe, False)[triangle]
 
-    def from_root(first, shadowed: Array) -> AtLevel:
-        listed = one_list(jax.lax.dynamic_slice_in_dim(casts, first, batch), LANES, batch)
-        own = jnp.append(jax.lax.dynamic_slice_in_dim(triangle, first, batch), n_triangles)
-        listed = eqx.tree_at(lambda lists: lists.triangle, listed, own[listed.triangle])
+    def batch_to(level: int, i, shadowed: Bool[Array, " places"]) -> AtLevel:
+        """A batch down to a level; `shadowed` by earlier ones."""
+        own = jnp.append(jax.lax.dynamic_slice_in_dim(triangle, i * size, size), n_triangles)
+        root = one_list(jax.lax.dynamic_slice_in_dim(casts, i * size, size), LANES, size)
+        root = NodeLists(own[root.triangle], root.start, root.count, root.node)
+        before = shadowed if plan.feedback else jnp.zeros_like(shadowed)
         counts = no_counts(n_levels, n_triangles)
-        root = AtLevel(listed, jnp.zeros(1, bool), jnp.zeros(1, jnp.int32), shadowed, counts)
-        return descend(root, 0, middle, volume, hierarchy, plan)
+        at = AtLevel(root, jnp.zeros(1, bool), jnp.zeros(1, jnp.int32), before, counts)
+        return descend(at, 0, level, volume, hierarchy, plan)
 
-    n_samples = hierarchy.samples.z_m.shape
-    n_items, words = hierarchy.tile_of_item.shape[0], max(1, n_samples[1] // 32)
-    zero = jnp.int64(0)
-    walk = Walk(
-        jnp.zeros((n_items, words), jnp.uint32), no_counts(n_levels, n_triangles), jnp.zeros(n_items, jnp.int32),
-        jnp.zeros(n_samples, jnp.int32), zero, zero, jnp.int32(0), jnp.bool_(False),
-    )  # fmt: skip
-    shadowed = jnp.zeros(n_shadowed_places(hierarchy), bool)
+    if plan.passes not in (1, 2):
+        raise InputError(f"passes={plan.passes}: must be 1 or 2.")
+    if plan.passes == 1:
+        return _one_pass(batch_to, n_batches, volume, hierarchy, plan)
+    return _two_passes(batch_to, n_batches, volume, hierarchy, plan)
 
-    if n_batches == 1 and not two_passes:
-        at = from_root(jnp.int32(0), shadowed)
+
+BatchTo = Callable[[int, Any, Bool[Array, " places"]], AtLevel]
+
+
+def _one_pass(batch_to: BatchTo, n_batches: int, volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> Walk:
+    """Each batch down to the samples."""
+    n_levels = len(hierarchy.table.level_nodes)
+    nothing = jnp.zeros(n_shadowed_places(hierarchy), bool)
+    walk = _no_walk(volume, hierarchy)
+    if n_batches == 1:
+        at = batch_to(n_levels, 0, nothing)
         return _with_whole_items(_with_samples(walk, at, volume, hierarchy, plan), at.shadowed, hierarchy)
-    if not two_passes:
 
-        def one_pass(i, state):
-            walk, shadowed = state
-            at = from_root(i * batch, shadowed if plan.feedback else jnp.zeros_like(shadowed))
-            walk = _with_samples(walk, at, volume, hierarchy, plan)
-            shadowed = shadowed | at.shadowed
-            return walk, _with_full_items(shadowed, walk.shadowed, hierarchy) if plan.feedback else shadowed
+    def one_batch(i, state):
+        walk, shadowed = state
+        at = batch_to(n_levels, i, shadowed)
+        walk = _with_samples(walk, at, volume, hierarchy, plan)
+        shadowed = shadowed | at.shadowed
+        return walk, _with_full_items(shadowed, walk.shadowed, hierarchy) if plan.feedback else shadowed
 
-        walk, shadowed = jax.lax.fori_loop(0, n_batches, one_pass, (walk, shadowed))
-        return _with_whole_items(walk, shadowed, hierarchy)
+    walk, shadowed = jax.lax.fori_loop(0, n_batches, one_batch, (walk, nothing))
+    return _with_whole_items(walk, shadowed, hierarchy)
 
-    def first_pass(i, state):
-        counts, shadowed, pairs, n_pairs = state
-        at = from_root(i * batch, shadowed if plan.feedback else jnp.zeros_like(shadowed))
-        more, n_more = pairs_of(at.lists, n_triangles, plan.pairs)
+
+def _two_passes(batch_to: BatchTo, n_batches: int, volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> Walk:
+    """Each batch down to a level; then what goes on there, all together."""
+    table, n_triangles = hierarchy.table, volume.safe.shape[0]
+    n_levels = len(table.level_nodes)
+    middle = restart_level(plan, n_levels)
+
+    def one_batch(i, state):
+        counts, shadowed, listed, node, n_pairs = state
+        at = batch_to(middle, i, shadowed)
+        (more_listed, more_node), n_more = pairs_of(at.lists, n_triangles, plan.pairs)
         # What does not fit is counted, not written: the walk is thrown away.
         place = jnp.minimum(n_pairs, plan.pairs)
-        pairs = tuple(jax.lax.dynamic_update_slice_in_dim(c, m, place, 0) for c, m in zip(pairs, more, strict=True))
-        return counts.plus(at.counts), shadowed | at.shadowed, pairs, jnp.minimum(n_pairs, 2**29) + n_more
+        listed = jax.lax.dynamic_update_slice_in_dim(listed, more_listed, place, 0)
+        node = jax.lax.dynamic_update_slice_in_dim(node, more_node, place, 0)
+        return counts.plus(at.counts), shadowed | at.shadowed, listed, node, jnp.minimum(n_pairs, 2**29) + n_more
 
-    none = jnp.full(2 * plan.pairs, n_triangles, jnp.int32)
-    state = (walk.counts, shadowed, (none, jnp.zeros_like(none)), jnp.int32(0))
-    if n_batches == 1:
-        counts, shadowed, pairs, n_pairs = first_pass(0, state)
-    else:
-        counts, shadowed, pairs, n_pairs = jax.lax.fori_loop(0, n_batches, first_pass, state)
-    n_nodes = hierarchy.table.level_nodes[middle]
-    pairs = tuple(column[: plan.pairs] for column in pairs)
+    places, none = jnp.zeros(n_shadowed_places(hierarchy), bool), jnp.full(2 * plan.pairs, n_triangles, jnp.int32)
+    state = (no_counts(n_levels, n_triangles), places, none, none, jnp.int32(0))
+    state = one_batch(0, state) if n_batches == 1 else jax.lax.fori_loop(0, n_batches, one_batch, state)
+    counts, shadowed, listed, node, n_pairs = state
+    listed, node, n_nodes = listed[: plan.pairs], node[: plan.pairs], table.level_nodes[middle]
     if n_batches > 1:  # each batch is in order of its nodes, all together are not
         there = jnp.arange(plan.pairs, dtype=jnp.int32) < n_pairs
-        node, listed = jax.lax.sort((jnp.where(there, pairs[1], n_nodes), pairs[0]), num_keys=1)
-        pairs = listed, node
-    own = int(hierarchy.table.first_child[middle - 1])
+        node, listed = jax.lax.sort((jnp.where(there, node, n_nodes), listed), num_keys=1)
+    own = int(table.first_child[middle - 1])
     in_shadow = shadowed[own : own + n_nodes]
     capacity = plan.level_groups[middle - 1] if plan.level_groups else plan.groups
-    lists = grouped(*pairs, n_pairs, in_shadow & plan.feedback, LANES, n_triangles, capacity)
-    at = AtLevel(lists, in_shadow, jnp.zeros(n_nodes, jnp.int32), shadowed, counts)
+    lists = grouped(listed, node, n_pairs, in_shadow & plan.feedback, LANES, n_triangles, capacity)
     n_dropped = jnp.minimum(n_pairs, plan.pairs) - jnp.sum(lists.count, dtype=jnp.int32)
-    at = eqx.tree_at(lambda at: at.counts.dropped, at, counts.dropped.at[middle - 1].add(n_dropped))
-    at = eqx.tree_at(lambda at: at.counts.refined, at, counts.refined.at[middle - 1].add(-n_dropped))
+    counts = eqx.tree_at(
+        lambda counts: (counts.dropped, counts.refined), counts,
+        (counts.dropped.at[middle - 1].add(n_dropped), counts.refined.at[middle - 1].add(-n_dropped)),
+    )  # fmt: skip
+    at = AtLevel(lists, in_shadow, jnp.zeros(n_nodes, jnp.int32), shadowed, counts)
     at = descend(at, middle, n_levels, volume, hierarchy, plan)
-    # The first pass' counts went through the second: they are not added twice.
-    walk = eqx.tree_at(lambda walk: walk.n_pairs, walk, n_pairs)
-    walk = eqx.tree_at(lambda walk: walk.overflowed, walk, n_pairs > plan.pairs)
+    walk = eqx.tree_at(
+        lambda walk: (walk.n_pairs, walk.overflowed), _no_walk(volume, hierarchy), (n_pairs, n_pairs > plan.pairs)
+    )
     return _with_whole_items(_with_samples(walk, at, volume, hierarchy, plan), at.shadowed, hierarchy)
+
+
+def _no_walk(volume: Volumes, hierarchy: Hierarchy) -> Walk:
+    n_samples, n_items = hierarchy.samples.z_m.shape, hierarchy.tile_of_item.shape[0]
+    zero = jnp.int64(0)
+    return Walk(
+        jnp.zeros((n_items, max(1, n_samples[1] // 32)), jnp.uint32),
+        no_counts(len(hierarchy.table.level_nodes), volume.safe.shape[0]), jnp.zeros(n_items, jnp.int32),
+        jnp.zeros(n_samples, jnp.int32), zero, zero, jnp.int32(0), jnp.bool_(False),
+    )  # fmt: skip
 
 
 def _with_samples(walk: Walk, at: AtLevel, volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> Walk:
@@ -152,10 +174,8 @@ def _with_samples(walk: Walk, at: AtLevel, volume: Volumes, hierarchy: Hierarchy
     tested = hierarchy.n_in_tile - done
     known = bits_of_samples(walk.shadowed, hierarchy) & plan.feedback
     own_length = length[jnp.clip(hierarchy.item_of_sample, 0, n_items - 1)]
-    n_groups = at.lists.triangle.shape[0]
-    group = jnp.arange(n_groups, dtype=jnp.int32)
-    item = jnp.minimum(last_not_above(at.lists.start, group), n_items - 1)
-    each = jnp.where(group < at.lists.n_groups, tested[item], 0)
+    is_used = jnp.arange(at.lists.triangle.shape[0], dtype=jnp.int32) < at.lists.n_groups
+    each = jnp.where(is_used, tested[jnp.minimum(at.lists.nodes(), n_items - 1)], 0)
     of_triangle = at.counts.of_triangle.at[at.lists.triangle].add(each[:, None])
     counts = eqx.tree_at(lambda counts: counts.of_triangle, at.counts, of_triangle)
     length64 = length.astype(jnp.int64)
@@ -211,20 +231,19 @@ def too_many(groups: Int[Array, " levels_and_1"], plan: ShadowPlan) -> Bool[Arra
 def count_volumes(volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> tuple[Int[Array, "items lanes"], Walk]:
     """In how many volumes each sample of the items' tiles lies; the walk's own bits are empty."""
     n_triangles, n_levels = volume.safe.shape[0], len(hierarchy.table.level_nodes)
-    n_samples = hierarchy.samples.z_m.shape
-    n_items, words = hierarchy.tile_of_item.shape[0], max(1, n_samples[1] // 32)
     root = AtLevel(
         one_list(volume.safe, LANES, n_triangles), jnp.zeros(1, bool), jnp.zeros(1, jnp.int32),
         jnp.zeros(n_shadowed_places(hierarchy), bool), no_counts(n_levels, n_triangles),
     )  # fmt: skip
     at = descend(root, 0, n_levels, volume, hierarchy, plan)
     total = held_counts(at.lists, at.cover, volume, hierarchy)
+    n_items = hierarchy.tile_of_item.shape[0]
     length = at.lists.count[:n_items]
     own_length = length[jnp.clip(hierarchy.item_of_sample, 0, n_items - 1)]
+    none = _no_walk(volume, hierarchy)
     walk = Walk(
-        jnp.zeros((n_items, words), jnp.uint32), at.counts, length,
-        jnp.where(hierarchy.samples.receives, own_length, 0),
-        jnp.sum(length.astype(jnp.int64) * hierarchy.n_in_tile), jnp.int64(0), jnp.int32(0),
+        none.shadowed, at.counts, length, jnp.where(hierarchy.samples.receives, own_length, 0),
+        jnp.sum(length.astype(jnp.int64) * hierarchy.n_in_tile), none.dropped_samples, none.n_pairs,
         too_many(at.counts.groups, plan),
     )  # fmt: skip
     return total, walk
