@@ -138,7 +138,7 @@ def test_shadow_techniques_are_tuned_as_others_and_not_among_them():
     page = Path("out/report.html").read_text()
     assert "2 of them with shadows" in page and "compared with one another only" in page
     is_refused(tune("--techniques", "ptsv,forward", out="b"), "ptsv,forward: one casts shadows, the other does not")
-    is_refused(tune("--techniques", "shadow_rays", out="c"), "--techniques shadow_rays: is what others are checked against")
+    is_refused(tune("--techniques", "shadow_rays", out="c"), "shadow_rays: is what others are checked against")
 
 
 def test_json_on_stdout_is_all_that_is_printed():
