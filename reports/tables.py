@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 from reports import number_text
@@ -31,6 +32,9 @@ COUNT_MEANINGS = {
     "test_and_set": "existing nodes or samples tested against a triangle; with a stencil, updates of it",
     "test_and_set_in_cluster": "the same, of a tile only the samples of the cluster",
     "node_tests": "nodes tested against a triangle",
+    "accepted": "nodes in a volume as a whole",
+    "refined": "nodes that go on to their children",
+    "dropped": "tests of nodes that feedback spares",
     "sample_tests": "samples tested against a triangle",
     "dropped_nodes": "tests of nodes that feedback spares",
     "dropped_samples": "tests of samples that feedback spares",
@@ -43,6 +47,8 @@ COUNT_MEANINGS = {
     "divergence": "32 times the longest list of each run of 32 samples",
     "dropped_at_cap": "lights lost at a cap per cell",
 }
+
+_OF_LEVELS = ("node_tests", "accepted", "refined", "dropped")
 
 
 @dataclass(frozen=True)
@@ -105,17 +111,25 @@ def count_rows(run: RunFolder) -> tuple[CountRow, ...]:
     """One row a count that any technique has; known ones first, in the order of the work."""
     known = list(COUNT_MEANINGS)
 
-    def stem(name: str) -> str:
-        return "dropped_at_cap" if name.startswith("dropped_at_cap") else name.split()[0]
-
     def place(name: str) -> int:
-        return known.index(stem(name)) if stem(name) in known else len(known)
+        return known.index(_stem(name)) if _stem(name) in known else len(known)
 
     found = dict.fromkeys(name for counts in run.counts.values() for name in counts)
     return tuple(
-        CountRow(name, COUNT_MEANINGS.get(stem(name), ""), tuple(counts.get(name) for counts in run.counts.values()))
+        CountRow(name, _what_is_counted(name), tuple(counts.get(name) for counts in run.counts.values()))
         for name in sorted(found, key=place)
     )
+
+
+def _stem(name: str) -> str:
+    """Without the level of a tree, or the cap."""
+    return re.sub(r"[_ ]\d+$", "", name)
+
+
+def _what_is_counted(name: str) -> str:
+    meaning = COUNT_MEANINGS.get(_stem(name), "")
+    of_level = _stem(name) != name and _stem(name) in _OF_LEVELS
+    return f"{meaning}, level {name.rsplit('_', 1)[-1]} below the root" if of_level else meaning
 
 
 def measurement_table(run: RunFolder) -> MeasurementTable:
