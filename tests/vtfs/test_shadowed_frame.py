@@ -128,7 +128,9 @@ def test_bits_of_a_layer_lie_at_its_own_runs():
     rng = np.random.default_rng(0)
     masks = rng.random((n_views, 2, n_visible, 32)) < 0.5
     found = shadow_bits(
-        [CastMask(jnp.asarray(m), jnp.bool_(False)) for m in masks.reshape(-1, n_visible, 32)], inputs.shadows.slots, layers
+        [CastMask(jnp.asarray(m), jnp.bool_(False)) for m in masks.reshape(-1, n_visible, 32)],
+        inputs.shadows.slots,
+        layers,
     )
     words = np.asarray(found.shadowed)
     assert (words[:n_visible] == masks[0, 0] + 2 * masks[0, 1]).all()
