@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tuning.family import TILES
+from tuning.family import COUNTS, TILES
 from tuning.questions import BUDGETS_MS, Answer, largest_within
 from tuning.table_model import TableModel
 
@@ -26,7 +26,8 @@ def budget_lines(model: TableModel) -> Iterator[str]:
             continue
         parts = model.parts(key)
         columns = sorted({name for part in parts for name in part.columns})
-        if len(columns) != 1 or columns[0] in TILES:  # a tile has a best size, not a largest
+        # A tile has a best size, not a largest; a count of work follows from sizes.
+        if len(columns) != 1 or columns[0] in TILES | COUNTS:
             continue
         (column,) = columns
         fitted = np.concatenate([part.hull[column] for part in parts if column in part.columns])

@@ -52,9 +52,9 @@ def test_a_frame_of_two_sizes_needs_more_than_one_number():
     assert not list(budget_lines(TableModel((), {(): two}, {})))
 
 
-def test_a_tile_has_a_best_size_and_no_largest():
-    law = Law((Term((Factor("tile_px"),)),), (0.1,), (0,))
-    tiles = TimeModel(
-        (PlausibleLaw(law, 1.0, np.zeros((1, 1)), 1e-9),), 30, 1e-9, 1.0, {"tile_px": np.array([8.0, 64.0])}, {}, (), ()
-    )
-    assert not list(budget_lines(TableModel((), {(): tiles}, {})))
+@pytest.mark.parametrize("column", ["tile_px", "shading_steps"])
+def test_a_tile_has_a_best_size_and_work_is_no_size(column):
+    law = Law((Term((Factor(column),)),), (0.1,), (0,))
+    hull = {column: np.array([8.0, 64.0])}
+    one = TimeModel((PlausibleLaw(law, 1.0, np.zeros((1, 1)), 1e-9),), 30, 1e-9, 1.0, hull, {}, (), ())
+    assert not list(budget_lines(TableModel((), {(): one}, {})))
