@@ -80,11 +80,14 @@ def fit(
     write_json(json_file, model.as_json() | {"fitted_to": source})
     if json_file == "-":
         return
+    from tuning.budget_lines import budget_lines
     from tuning.model_table import print_models
 
     print(f"{source}: {len(table)} rows, {len(model.models)} {'model' if len(model.models) == 1 else 'models'}")
     for note in notes:
         print(note)
     print_models(model)
+    for line in budget_lines(model):
+        print(line)
     if json_file:
         print(f"Model: {json_file}")
