@@ -44,6 +44,7 @@ _STAGE_COLOURS = {
     "sort": "#5f9488",
     "build_tree": "#3f6f75",
     "assign": "#39587d",
+    "approximate": "#5b7fa6",
     "shade_opaque": "#d9a25f",
     "shade_transparent": "#c47a4a",
     "shadow_planes": "#b4a7c6",

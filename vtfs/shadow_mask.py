@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vtfs.cluster_grid import ClusterGrid
 from vtfs.gbuffer import Fragments, Positions, to_runs
+from vtfs.layers import Layers
 from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight
 from vtfs.shadow_volumes.planes import Extra, Precision
 
@@ -212,10 +213,12 @@ def shadow_frame(
     """
     camera = samples.camera
     mask = samples.valid if receives is None else receives & samples.valid
+    # Transparent layers are views of their own.
+    alone = replace(samples, layers=Layers())
     with jax.enable_x64(True):
         put: Any = jax.device_put
         return ShadowFrame(
-            positions=Fragments(samples, with_hidden=False).positions() if positions is None else positions,
+            positions=Fragments(alone, with_hidden=False).positions() if positions is None else positions,
             receives=put(to_runs(mask)),
             grid=grid,
             vertex_m=casters.vertex_m,

@@ -7,10 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
 
 from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight
 
@@ -42,7 +39,7 @@ def kept_casters(casters: Casters, light: ShadowLight, front_faces: FrontFaces) 
     return Casters(casters.vertices_m, casters.triangles[~facing_light(casters, light)])
 
 
-def _moved(points_m: np.ndarray, light: np.ndarray, bias_m: float) -> tuple[np.ndarray, np.ndarray]:
+def moved_points(points_m: np.ndarray, light: np.ndarray, bias_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Points moved toward the light by the bias, at most onto it; and the way from there to the light."""
     if light[3] == 0:
         moved = points_m + bias_m * light[:3]
@@ -73,8 +70,8 @@ def brute_force(
     if not casters.n_triangles or not len(points_m):
         return shadowed
     homogeneous = light.homogeneous - np.append(origin, 0) * light.homogeneous[3]
-    moved, _ = _moved(points_m, homogeneous, bias_m)
-    planes, behind = _volume_planes(casters, origin, homogeneous)
+    moved, _ = moved_points(points_m, homogeneous, bias_m)
+    planes, behind = volume_planes(casters, origin, homogeneous)
     moved = moved if light.directional else moved - homogeneous[:3]
     n_points = max(1, min(len(points_m), _PAIRS_AT_ONCE // casters.n_triangles))
 
@@ -93,51 +90,7 @@ def brute_force(
     return shadowed
 
 
-def brute_force_on_device(
-    points_m: np.ndarray, casters: Casters, light: ShadowLight, bias_m: float, origin_m: np.ndarray | None = None
-) -> np.ndarray:
-    """`brute_force` by XLA: a GPU tests every sample of a large view in a second."""
-    origin = np.zeros(3) if origin_m is None else np.asarray(origin_m, np.float64)
-    if not casters.n_triangles or not len(points_m):
-        return np.zeros(len(points_m), bool)
-    homogeneous = light.homogeneous - np.append(origin, 0) * light.homogeneous[3]
-    moved, _ = _moved(points_m, homogeneous, bias_m)
-    moved = moved if light.directional else moved - homogeneous[:3]
-    planes, behind = _volume_planes(casters, origin, homogeneous)
-    n_points = -(-len(moved) // _POINTS_STEP) * _POINTS_STEP
-    n_triangles = -(-casters.n_triangles // _TRIANGLES_STEP) * _TRIANGLES_STEP
-    more = n_triangles - casters.n_triangles
-    normals = np.pad(np.stack(planes).transpose(0, 2, 1), ((0, 0), (0, 0), (0, more)))
-    offsets = np.pad(np.stack(behind), ((0, 0), (0, more)), constant_values=np.inf)
-    padded = np.pad(moved, ((0, n_points - len(moved)), (0, 0)))
-    with jax.enable_x64(True):
-        return np.asarray(_held_by_some(padded.T, normals, offsets))[: len(moved)]
-
-
-_POINTS_STEP, _TRIANGLES_STEP = 2**16, 2**12
-
-
-@jax.jit
-def _held_by_some(
-    point: Float[Array, "3 points"], normals: Float[Array, "4 3 triangles"], offsets: Float[Array, "4 triangles"]
-) -> Bool[Array, " points"]:
-    def step(i, held):
-        some = (jax.lax.dynamic_slice_in_dim(c, i * _TRIANGLES_STEP, _TRIANGLES_STEP, c.ndim - 1) for c in
-                (normals, offsets))  # fmt: skip
-        normal, offset = some
-        x, y, z = point
-        inside = True
-        for k in range(4):
-            n = normal[k]
-            distance = n[0][:, None] * x + n[1][:, None] * y + n[2][:, None] * z
-            inside = inside & (distance > offset[k][:, None] if k == 3 else distance >= offset[k][:, None])
-        return held | jnp.any(inside, axis=0)
-
-    n_steps = offsets.shape[1] // _TRIANGLES_STEP
-    return jax.lax.fori_loop(0, n_steps, step, jnp.zeros(point.shape[1], bool))
-
-
-def _volume_planes(
+def volume_planes(
     casters: Casters, origin_m: np.ndarray, light: np.ndarray
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
     """Inward normals `[T, 3]` of the three side planes and the triangle's, and the products that points inside exceed.
@@ -188,7 +141,7 @@ class ShadowRays:
             return np.zeros(len(points_m), bool)
         origin = np.zeros(3) if origin_m is None else np.asarray(origin_m, np.float64)
         homogeneous = light.homogeneous
-        start, way = _moved(points_m, homogeneous - np.append(origin, 0) * homogeneous[3], bias_m)
+        start, way = moved_points(points_m, homogeneous - np.append(origin, 0) * homogeneous[3], bias_m)
         if light.directional:
             way = way * (4 * self._extent_m + 4 * np.abs(start + origin - self._middle_m).max())
         start = np.ascontiguousarray(start + (origin - self._middle_m), np.float32)

@@ -21,7 +21,7 @@ def held_samples(
     lists: NodeLists, volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan
 ) -> UInt32[Array, "items words"]:
     """Which samples of each item's tile lie in a volume of its list."""
-    rows = _sample_rows(hierarchy, volume)
+    rows = sample_rows(hierarchy, volume)
     if plan.level_groups:
         bits = _tested_at_once(lists, volume, hierarchy, rows)
     else:
@@ -31,7 +31,7 @@ def held_samples(
     return _merged(bits, lists, hierarchy.tile_of_item.shape[0])
 
 
-def _sample_rows(hierarchy: Hierarchy, volume: Volumes) -> Float[Array, "tiles 4 lanes"]:
+def sample_rows(hierarchy: Hierarchy, volume: Volumes) -> Float[Array, "tiles 4 lanes"]:
     """Position of each sample of a tile, and its bias over its distance to the light."""
     samples = hierarchy.samples
     position = [samples.x_m, samples.y_m, samples.z_m]
