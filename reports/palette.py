@@ -73,3 +73,10 @@ def in_stage_order(stages: Iterable[str]) -> list[str]:
     """Stages as a frame runs them; unknown ones last, by name."""
     order = list(_STAGE_COLOURS)
     return sorted(set(stages), key=lambda stage: (order.index(stage) if stage in order else len(order), stage))
+
+
+# Of stability: right, a few wrong samples, failing, without an answer; read with their words, not by colour alone.
+HOLDS = "#cfe8d5"
+FEW = ("#fdf0c8", "#f3cf73")
+FAILS = ("#efa083", "#b3362b")
+NOT_RUN = "#dfe3e6"
