@@ -21,6 +21,10 @@ _COLOURS = {
     "clustered_deferred": "#5b5f97",
     "volume_tiled": "#4a9a4f",
     "volume_tiled_bvh": "#0b857a",
+    "z_pass": "#8c6d1f",
+    "z_fail": "#b4531c",
+    "ptsv": "#2a67b1",
+    "cluster_hierarchy": "#0b857a",
 }
 _SYMBOLS = {
     "forward": "triangle-up",
@@ -33,6 +37,10 @@ _SYMBOLS = {
     "clustered_forward": "pentagon",
     "clustered_deferred": "hexagon",
     "volume_tiled": "star",
+    "z_pass": "triangle-up",
+    "z_fail": "triangle-down",
+    "ptsv": "square",
+    "cluster_hierarchy": "circle",
 }
 _OTHER_COLOURS = ("#44546a", "#7a4b2a", "#2f7d5b", "#7a3f8c", "#8c6d1f")
 
@@ -51,6 +59,7 @@ _STAGE_COLOURS = {
     "shadow_build": "#8d7fa8",
     "shadow_traverse": "#6a5b8a",
     "shadow_merge": "#c5b2a0",
+    "shadow_bits": "#a08f86",
 }
 _OTHER_STAGE_COLOUR = "#b9bfc5"
 

@@ -18,6 +18,7 @@ _SHOWS = {
     "clusters": "The cells that samples lie in.",
     "slices": "The depth slice of each sample.",
     "false_positives": "Lights listed for a sample that do not reach it.",
+    "shadows": "The shadows that were found.",
 }
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -27,7 +28,7 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 class Picture:
     """One PNG as a data URI, so that the page needs no other file.
 
-    - `max_count`, `mean_count`: lighting computations per pixel, of a heat map.
+    - `unit`: what a heat map shows; `max_count`, `mean_count`: of it per pixel.
     """
 
     uri: str
@@ -38,6 +39,7 @@ class Picture:
     height_px: int
     max_count: float | None
     mean_count: float | None
+    unit: str = "lighting computations per pixel"
 
     @property
     def alternative(self) -> str:
@@ -50,19 +52,20 @@ class Picture:
             if value is not None
         ]
         counted = f": {', '.join(numbers)}" if numbers else ""
-        return f"Heat map of lighting computations per pixel with {self.technique}{counted}."
+        return f"Heat map of {self.unit} with {self.technique}{counted}."
 
 
 @dataclass(frozen=True)
 class HeatScale:
     """The colour scale that all heat maps share.
 
-    - `ticks`: place along the bar in percent, and the count there.
+    - `ticks`: place along the bar in percent, and the count there; `unit`: of what.
     """
 
     gradient: str
     ticks: tuple[tuple[float, float], ...]
     is_log: bool
+    unit: str
 
 
 def read_pictures(folder: Path, listed: list[dict[str, Any]]) -> tuple[Picture, ...]:
@@ -92,6 +95,7 @@ def heat_scale(pictures: tuple[Picture, ...], given: dict[str, Any]) -> HeatScal
         gradient=f"linear-gradient(to right, {', '.join(_checked_colour(colour) for colour in colours)})",
         ticks=_log_ticks(top) if is_log else _linear_ticks(top),
         is_log=is_log,
+        unit=next(picture.unit for picture in pictures if picture.kind == "heat_map"),
     )
 
 
@@ -117,6 +121,7 @@ def _picture(folder: Path, item: dict[str, Any]) -> Picture:
         height_px=height_px,
         max_count=_count(item.get("max_count")),
         mean_count=_count(item.get("mean_count")),
+        unit=str(item.get("unit") or Picture.unit),
     )
 
 

@@ -163,6 +163,10 @@ class RunFolder:
     def objective(self) -> str:
         return "mean" if self.result.get("objective") == "mean" else "max"
 
+    @property
+    def casts_shadows(self) -> bool:
+        return self.result.get("kind") == "shadows"
+
     def quoted(self, *keys: str) -> Any:
         """A value of `result.json` by its path, or None where it or anything above it is absent."""
         value: Any = self.result

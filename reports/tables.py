@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 from reports import number_text
 from reports.recommendation import Setting
 from reports.run_folder import RunFolder, StageModel, Timed, frame_medians_ms
+from tuning.features import main_work
 from tuning.measurement import Measurement
 from vtfs.parameters import PARAMETERS, Value
 
@@ -23,13 +25,30 @@ COUNT_MEANINGS = {
     "approximated_pairs": "entries evaluated once for a cell",
     "lighting_computations_saved": "what that spared",
     "lighting_computations_tile_area": "the same as tile area times list length (2011 paper)",
-    "test_and_set": "existing nodes or samples tested against a triangle",
+    "shadow_lights": "lights that cast shadows",
+    "shadow_samples": "samples that they would light",
+    "casters": "triangles with a shadow volume",
+    "shadow_clusters": "tiles or clusters of these samples",
+    "test_and_set": "existing nodes or samples tested against a triangle; with a stencil, updates of it",
+    "test_and_set_in_cluster": "the same, of a tile only the samples of the cluster",
+    "node_tests": "nodes tested against a triangle",
+    "accepted": "nodes in a volume as a whole",
+    "refined": "nodes that go on to their children",
+    "dropped": "tests of nodes that feedback spares",
+    "sample_tests": "samples tested against a triangle",
+    "dropped_nodes": "tests of nodes that feedback spares",
+    "dropped_samples": "tests of samples that feedback spares",
+    "tests_of_largest": "tests of the 1,024 triangles with the most: how unevenly the work lies",
+    "listed_pairs": "entries of all lists of triangles",
+    "longest_shadow_list": "triangles tested against one tile or cluster, at most",
     "extra_plane_tests": "tests of the extra planes",
     "bytes_moved": "bytes read and written",
     "memory": "bytes held",
     "divergence": "32 times the longest list of each run of 32 samples",
     "dropped_at_cap": "lights lost at a cap per cell",
 }
+
+_OF_LEVELS = ("node_tests", "accepted", "refined", "dropped")
 
 
 @dataclass(frozen=True)
@@ -92,17 +111,25 @@ def count_rows(run: RunFolder) -> tuple[CountRow, ...]:
     """One row a count that any technique has; known ones first, in the order of the work."""
     known = list(COUNT_MEANINGS)
 
-    def stem(name: str) -> str:
-        return "dropped_at_cap" if name.startswith("dropped_at_cap") else name.split()[0]
-
     def place(name: str) -> int:
-        return known.index(stem(name)) if stem(name) in known else len(known)
+        return known.index(_stem(name)) if _stem(name) in known else len(known)
 
     found = dict.fromkeys(name for counts in run.counts.values() for name in counts)
     return tuple(
-        CountRow(name, COUNT_MEANINGS.get(stem(name), ""), tuple(counts.get(name) for counts in run.counts.values()))
+        CountRow(name, _what_is_counted(name), tuple(counts.get(name) for counts in run.counts.values()))
         for name in sorted(found, key=place)
     )
+
+
+def _stem(name: str) -> str:
+    """Without the level of a tree, or the cap."""
+    return re.sub(r"[_ ]\d+$", "", name)
+
+
+def _what_is_counted(name: str) -> str:
+    meaning = COUNT_MEANINGS.get(_stem(name), "")
+    of_level = _stem(name) != name and _stem(name) in _OF_LEVELS
+    return f"{meaning}, level {name.rsplit('_', 1)[-1]} below the root" if of_level else meaning
 
 
 def measurement_table(run: RunFolder) -> MeasurementTable:
@@ -115,7 +142,11 @@ def measurement_table(run: RunFolder) -> MeasurementTable:
         ("slowest frame, ms", "median over the repeats of the slowest of the measured frames", True),
         ("mean, ms", "mean over the measured frames of their medians", True),
         ("error", "RMSE over RMS of the float64 reference image", True),
-        ("lighting computations", "lights times samples, on the frame with the most", True),
+        (
+            ("shadow tests", "nodes and samples tested against triangles, on the frame with the most", True)
+            if run.casts_shadows
+            else ("lighting computations", "lights times samples, on the frame with the most", True)
+        ),
         ("compile, s", "time to compile the programs of this configuration", True),
         ("outcome", "", False),
     )
@@ -127,7 +158,7 @@ def _row(number: int, line: Measurement, varying: list[str], best: Timed | None)
     medians_ms = frame_medians_ms(line)
     slowest_ms = max(medians_ms, default=None)
     mean_ms = sum(medians_ms) / len(medians_ms) if medians_ms else None
-    computations = line.counts[0].get("lighting_computations") if line.counts else None
+    work = main_work(line.counts[0]) if line.counts else None
     cells = (
         Cell(str(number), number, is_number=True),
         Cell(line.technique, line.technique, is_code=True),
@@ -135,7 +166,7 @@ def _row(number: int, line: Measurement, varying: list[str], best: Timed | None)
         _number_cell(slowest_ms, number_text.digits),
         _number_cell(mean_ms, number_text.digits),
         _number_cell(line.error, number_text.error),
-        _number_cell(computations, number_text.count),
+        _number_cell(work, number_text.count),
         _number_cell(line.compile_s if math.isfinite(line.compile_s) else None, lambda value: f"{value:.1f}"),
         Cell(line.outcome.replace("_", " "), line.outcome),
     )

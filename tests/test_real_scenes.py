@@ -70,3 +70,20 @@ def test_the_main_job(tmp_path):
     assert result["scene"]["triangles"] == 58_770 and result["scene"]["lights"] == 2000
     assert result["measured"] == 2 and result["best"]["technique"] != "forward"
     assert (tmp_path / "report.html").stat().st_size > 100_000
+
+
+def test_shadows_are_checked_and_timed(tmp_path):
+    """On 58,770 triangles: a mask with one wrong sample beyond the bands would be a failure, not a time."""
+    space = tmp_path / "one.toml"
+    space.write_text("[parameters]\nbranching = [32]\n")
+    with short_repeats():
+        ran = vtfs(
+            "tune", *files("zdm2"), *SIZE, *LIGHTS, "--shadow-lights", "2", "--techniques", "cluster_hierarchy",
+            "--space", space, "--budget", "1", "--out", tmp_path / "out",
+        )  # fmt: skip
+    assert ran.code == 0 and ran.err == ""
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["kind"] == "shadows" and result["measured"] == 1 and result["failed"] == 0
+    assert result["best"]["error"] < 1e-4
+    counts = result["counts"]["cluster_hierarchy"]
+    assert counts["shadow_lights"] == 2 and counts["casters"] > 20_000 and counts["test_and_set"] > 1e6

@@ -191,7 +191,7 @@ def work_done(candidate: Configuration, counts: Counts) -> tuple[object, ...]:
     The counts show what tiles, slices and branching do, and where loops are counted also what a batch does.
     """
     shown = {"tile_px", "depth_slices", "branching"}
-    if all({"assign_steps", "shading_steps"} & frame.keys() for frame in counts):
+    if all({"assign_steps", "shading_steps"} & frame.keys() and "shadow_lights" not in frame for frame in counts):
         shown.add("batch")
     hidden = tuple(item for item in candidate.items if item[0] not in shown)
     return candidate.technique, hidden, tuple(tuple(sorted(frame.items())) for frame in counts)

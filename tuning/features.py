@@ -21,6 +21,10 @@ STAGE_TERMS: dict[str, tuple[str, ...]] = {
     # Lanes are the lighting computations that the SIMD loop really runs, those that divergence wastes included.
     "shade_opaque": ("samples", "lighting_computations", "shading_lanes", "shading_steps"),
     "shade_transparent": ("transparent_samples", "lighting_computations", "shading_lanes", "shading_steps"),
+    "shadow_planes": ("casters",),
+    "shadow_build": ("shadow_samples", "shadow_clusters"),
+    "shadow_traverse": ("node_tests", "sample_tests", "listed_pairs", "extra_plane_tests"),
+    "shadow_merge": ("shadow_samples", "shadow_clusters"),
     "frame": (
         "samples",
         "cells_total",
@@ -31,6 +35,10 @@ STAGE_TERMS: dict[str, tuple[str, ...]] = {
         "shading_lanes",
         "shading_steps",
         "assign_steps",
+        "node_tests",
+        "sample_tests",
+        "listed_pairs",
+        "shadow_clusters",
     ),
 }
 """Candidate terms of each stage, the first of two that say the same preferred."""
@@ -66,6 +74,14 @@ def with_derived(counts: Mapping[str, int]) -> dict[str, float]:
     if tests:
         derived["tests"] = sum(tests)
     return derived
+
+
+def main_work(counts: Mapping[str, int]) -> int:
+    """What tells busy frames and hopeless techniques: nodes and samples tested against triangles where shadows are
+    cast, else lighting computations."""
+    if "shadow_lights" in counts:
+        return counts.get("node_tests", 0) + counts.get("sample_tests", 0)
+    return counts.get("lighting_computations", 0)
 
 
 def operations(counts: Sequence[Mapping[str, int]], terms: Sequence[str]) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,62 +14,118 @@ from tuning.sweep import SearchResult
 from tuning.workload import SceneWorkload
 from vtfs.image import exposure, heat_map, random_colours, tone_map, write_png
 from vtfs.op_counts import CAPS
-from vtfs.parameters import Configuration, configuration
+from vtfs.parameters import SHADOW_NAMES, Configuration, configuration
+from vtfs.shadow_maps import ShadowMaps
 
 _BINS = 24
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What `result.json` lists: files in the folder, and list lengths of each technique."""
+    """What `result.json` lists: files in the folder, and list lengths of each technique.
+
+    - `heat_scale`: of the heat maps.
+    """
 
     pictures: list[dict[str, Any]]
     list_lengths: list[dict[str, Any]]
+    heat_scale: Literal["linear", "log"]
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "pictures": self.pictures,
+            "list_lengths": self.list_lengths,
+            "heat_scale": {"scale": self.heat_scale},
+        }
 
 
 def draw(workload: SceneWorkload, found: SearchResult, folder: Path) -> Drawn:
-    """Write the best configuration's image, heat maps of lighting computations on one scale, and the cells of the
-    fastest technique that has any; all of the frame with the most work.
+    """Write the best configuration's image, heat maps of the work on one scale, and the cells of the fastest technique
+    that has any, or the shadows; all of the frame with the most work.
 
     **Returns:** also, for each technique whose cells have lists, a histogram of their lengths and what engines that cap
     them would drop.
     """
-    valid = workload.valid()
-    image = workload.image(_config(found.best))
-    write_png(folder / "frame.png", tone_map(image, exposure(image, valid)))
+    best = _config(found.best)
+    casts = best.technique in SHADOW_NAMES
+    image = workload.image(best)
+    write_png(folder / "frame.png", tone_map(image, exposure(image, workload.valid())))
     pictures: list[dict[str, Any]] = [
         {
             "file": "frame.png",
             "kind": "frame",
-            "technique": found.best.technique,
-            "caption": f"Frame {workload.frames[0]}, the one with the most lighting computations, "
-            f"as {found.best.technique} renders it.",
+            "technique": best.technique,
+            "caption": f"Frame {workload.frames[0]}, the one with the most "
+            f"{'tests' if casts else 'lighting computations'}, as {best.technique} renders it.",
         }
     ]
     fastest: dict[str, Measurement] = {}
-    for m in found.measurements:
-        if is_timed(m) and _config(m).is_exact:
-            fastest[m.technique] = min(fastest.get(m.technique, m), m, key=lambda m: time_ms(m, "max"))
+    for m in sorted(filter(is_timed, found.measurements), key=lambda m: time_ms(m, "max")):
+        if _config(m).is_exact:
+            fastest.setdefault(m.technique, m)
+    if casts:
+        maps = {technique: workload.shadow_maps(_config(m)) for technique, m in fastest.items()}
+        pictures.append(_shadows(best, workload.shadow_maps(best), folder))
+        tests = {technique: own.tests for technique, own in maps.items()}
+        unit = "triangles tested against a pixel's tile or cluster"
+        return Drawn(pictures + _heat_maps(workload, fastest, tests, unit, "log", folder), [], "log")
     lengths = {technique: workload.list_lengths(_config(m)) for technique, m in fastest.items()}
-    listed = [own for technique, own in lengths.items() if technique != "forward"] or list(lengths.values())
-    largest = max((int(own.of_sample.max(initial=0)) for own in listed), default=0)
-    for technique, own in lengths.items():
+    computations = {technique: own.of_sample for technique, own in lengths.items()}
+    pictures += _heat_maps(workload, fastest, computations, "lighting computations per pixel", "linear", folder)
+    pictures += _cells(workload, list(fastest.values()), folder)
+    of_cluster = {technique: own.of_cluster for technique, own in lengths.items() if technique != "forward"}
+    return Drawn(pictures, _histograms({t: own for t, own in of_cluster.items() if len(own)}), "linear")
+
+
+def _heat_maps(
+    workload: SceneWorkload,
+    fastest: dict[str, Measurement],
+    work: dict[str, np.ndarray],
+    unit: str,
+    scale: Literal["linear", "log"],
+    folder: Path,
+) -> list[dict[str, Any]]:
+    """One picture a technique, all on one scale; `log` where tiles differ by powers of ten."""
+    valid = workload.valid()
+    scaled = [own for technique, own in work.items() if technique != "forward"] or list(work.values())
+    largest = max((int(own.max(initial=0)) for own in scaled), default=0)
+    pictures = []
+    for technique, own in work.items():
         name = f"heat_{technique}.png"
-        write_png(folder / name, heat_map(own.of_sample, largest, valid))
+        shown, top = (own, largest) if scale == "linear" else (_log(own), int(_log(np.array(largest))))
+        write_png(folder / name, heat_map(shown, top, valid))
         pictures.append(
             {
                 "file": name,
                 "kind": "heat_map",
                 "technique": technique,
-                "caption": f"Lighting computations per pixel, {_config(fastest[technique])}.",
-                "max_count": int(own.of_sample.max(initial=0)),
-                "mean_count": float(own.of_sample[valid].mean()) if valid.any() else 0.0,
+                "caption": f"{unit[0].upper()}{unit[1:]}, {_config(fastest[technique])}.",
+                "unit": unit,
+                "max_count": int(own.max(initial=0)),
+                "mean_count": float(own[valid].mean()) if valid.any() else 0.0,
                 "scale_max": largest,
             }
         )
-    pictures += _cells(workload, sorted(fastest.values(), key=lambda m: time_ms(m, "max")), folder)
-    of_cluster = {technique: own.of_cluster for technique, own in lengths.items() if technique != "forward"}
-    return Drawn(pictures, _histograms({t: own for t, own in of_cluster.items() if len(own)}))
+    return pictures
+
+
+def _log(counts: np.ndarray) -> np.ndarray:
+    """Thousandths of log(1 + count), whole."""
+    return np.round(1000 * np.log1p(counts)).astype(np.int64)
+
+
+def _shadows(best: Configuration, maps: ShadowMaps, folder: Path) -> dict[str, Any]:
+    """What share of the lights that cast and would light it each pixel is lit by."""
+    lit = maps.lit > 0
+    share = 1 - maps.shadowed / np.maximum(maps.lit, 1)
+    write_png(folder / "shadows.png", heat_map(np.round(1000 * share).astype(np.int64), 1000, lit))
+    return {
+        "file": "shadows.png",
+        "kind": "shadows",
+        "technique": best.technique,
+        "caption": "Dark in the shadow of all lights that cast and would light the pixel, bright in that of none: "
+        f"{maps.shadowed.sum() / max(int(maps.lit.sum()), 1):.1%} in shadow.",
+    }
 
 
 def _cells(workload: SceneWorkload, fastest_first: list[Measurement], folder: Path) -> list[dict[str, Any]]:

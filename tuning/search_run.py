@@ -11,6 +11,7 @@ from typing import Protocol
 from tuning.budget import Budget
 from tuning.choose import Counts, Objective, is_timed, time_ms
 from tuning.cost_model import CostModel
+from tuning.features import main_work
 from tuning.measurement import Measurement
 from tuning.record import append_measurement, read_measurements
 from tuning.select import fit_stage
@@ -109,8 +110,8 @@ class SearchRun:
                 self._record(candidate, None)
         return self._counts[candidate]
 
-    def lighting_computations(self, candidate: Configuration) -> int:
-        return sum(frame.get("lighting_computations", 0) for frame in self.counts(candidate))
+    def main_work(self, candidate: Configuration) -> int:
+        return sum(map(main_work, self.counts(candidate)))
 
     def measure(self, candidate: Configuration, share: float = 1.0) -> bool:
         """Measure and record it, unless that was done; False where the budget's `share` was used up before."""

@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 
 from vtfs.input_error import InputError
-from vtfs.parameters import PARAMETERS, TECHNIQUES, Configuration, ConflictError, Value, configuration
+from vtfs.parameters import PARAMETERS, SHADOW_NAMES, TECHNIQUES, Configuration, ConflictError, Value, configuration
 
 LARGEST_SPACE = 100_000
 """More combinations than this are refused: counting them all would take hours."""
@@ -81,13 +81,18 @@ def default_space(techniques: Iterable[str], n_samples: int) -> Space:
 
     - `n_samples`: view samples of a frame. A batch that holds them all is the same as `batch = 0`.
     """
-    speed: dict[str, tuple[Value, ...]] = {
+    lights: dict[str, tuple[Value, ...]] = {
         "tile_px": (8, 16, 32, 64),
         "depth_slices": (0, 16, 32, 64),
         "branching": (8, 32),
         "batch": (0, *(size for size in (16384, 65536) if size < n_samples)),
     }
-    return _space(tuple(techniques), speed, ())
+    # A tile size of shadows compiles too.
+    shadows: dict[str, tuple[Value, ...]] = {"tile_px": (4, 8, 16), "depth_slices": (0, 32), "branching": (8, 32)}
+    names = tuple(techniques)
+    of_technique = {name: shadows if name in SHADOW_NAMES else lights for name in names}
+    values = {name: {k: v for k, v in own.items() if k in TECHNIQUES[name]} for name, own in of_technique.items()}
+    return Space(names, values)
 
 
 def accuracy_values() -> tuple[dict[str, Value], ...]:
@@ -96,6 +101,8 @@ def accuracy_values() -> tuple[dict[str, Value], ...]:
     They are tried at the best exact configuration, for the chart of speed against error.
     """
     return (
+        {"front_faces": "culled"},
+        {"stencil": "wrap"},
         {"light_cutoff": 0.01},
         {"gbuffer": "float16"},
         {"approximate": 0.01},

@@ -22,7 +22,7 @@ from tuning.measurement import Measurement
 from tuning.search_run import Progress, SearchRun, Workload
 from tuning.select import fit_models
 from tuning.space import Space, accuracy_values
-from vtfs.parameters import Configuration, configuration
+from vtfs.parameters import SHADOW_NAMES, Configuration, configuration
 
 HOPELESS = 12
 """A technique whose default needs this many times the lighting computations of the thriftiest is not measured."""
@@ -106,7 +106,7 @@ def search(
     design = initial_design(hopeful, run.counts, seed)
     defaults, spread = design[: len(hopeful.techniques)], design[len(hopeful.techniques) :]
     # Thrifty ones first: what is there to beat is then known when the slow ones are measured.
-    in_budget = all(run.measure(candidate) for candidate in sorted(defaults, key=run.lighting_computations))
+    in_budget = all(run.measure(candidate) for candidate in sorted(defaults, key=run.main_work))
     explored, not_explored = _explored(hopeful, run)
 
     share = 1 - _ACCURACY_SHARE
@@ -154,10 +154,11 @@ def _hopeful(space: Space, run: SearchRun, keep: Collection[str]) -> tuple[Space
     excluded = dict.fromkeys(unreachable, "the constraints leave no configuration of it")
     space = space.limited_to(reachable)
     defaults = {name: configuration(name) for name in space.techniques}
-    work = {name: run.lighting_computations(default) for name, default in defaults.items() if run.counts(default)}
+    work = {name: run.main_work(default) for name, default in defaults.items() if run.counts(default)}
     least = min(work.values(), default=0)
+    unit = "tests" if set(space.techniques) & set(SHADOW_NAMES) else "lighting computations"
     reasons = {
-        name: f"its default needs {work[name] / least:.0f} times the lighting computations of "
+        name: f"its default needs {work[name] / least:.0f} times the {unit} of "
         f"{min(work, key=work.__getitem__)}'s ({work[name]:,} and {least:,})"
         for name in work
         if least > 0 and work[name] > HOPELESS * least and name not in keep

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 from tuning.budget import Budget
 from tuning.choose import Objective, is_timed, median_interval, time_interval_ms, time_ms
 from tuning.compiles import watch_compiles
+from tuning.features import main_work
 from tuning.measurement import Measurement
 from tuning.run_pictures import draw
 from tuning.search_run import Progress
@@ -24,12 +25,14 @@ from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_cou
 from vtfs.device import versions
 from vtfs.files import write_atomically
 from vtfs.frame import FrameInputs
-from vtfs.parameters import Configuration, configuration
+from vtfs.input_error import InputError
+from vtfs.parameters import SHADOW_NAMES, SHADOW_REFERENCES, Configuration, configuration
 from vtfs.scene_setup import SceneSetup
 
 DEFAULT_BUDGET = Budget(seconds=40.0)
 """On two CPU cores a frame costs half a second: a dozen configurations, and a minute for the whole command."""
 DEFAULT_CONFIGURATION = configuration("tiled_deferred")
+DEFAULT_SHADOWS = configuration("cluster_hierarchy")
 
 CLAIM = "for this JAX implementation on this device; nothing is rasterised: frame times start at view samples"
 
@@ -62,9 +65,11 @@ def tune(
     """
     started, compiles = time.perf_counter(), watch_compiles()
     tell("tracing view samples and counting the frames of the path")
-    frames = choose_frames(setup)
+    casts = casts_shadows(options.techniques)
+    frames = choose_frames(setup, DEFAULT_SHADOWS if casts else DEFAULT_CONFIGURATION)
+    samples = tuple(setup.samples(f) for f in frames)
     workload = SceneWorkload(
-        ScenePath(setup.key, frames, tuple(setup.samples(f) for f in frames), setup.lights, options.seed),
+        ScenePath(setup.key, frames, samples, setup.lights, options.seed, setup.shadow_scene if casts else None),
         compiles,
         options.objective,
     )
@@ -91,6 +96,7 @@ def tune(
         "schema": 1,
         "command": options.command,
         "claim": CLAIM,
+        "kind": "shadows" if casts else "lights",
         "scene": {
             "name": setup.name,
             "triangles": setup.n_triangles,
@@ -99,6 +105,7 @@ def tune(
             "key": setup.key,
             "viewport": [setup.cameras.viewport.width_px, setup.cameras.viewport.height_px],
             "measured_frames": list(frames),
+            **({"shadow_lights": workload.n_shadow_lights} if casts else {}),
         },
         "device": workload.device,
         "versions": versions(),
@@ -133,8 +140,7 @@ def tune(
             name: dict(counts[0]) for name in space.techniques if (counts := workload.counts(configuration(name)))
         },
         "stages": _stages(found, options.objective),
-        "pictures": drawn.pictures,
-        "list_lengths": drawn.list_lengths,
+        **drawn.as_json(),
     }
     result |= {
         "compiled_programs": compiles.programs,
@@ -145,13 +151,33 @@ def tune(
     return result
 
 
-def choose_frames(setup: SceneSetup) -> tuple[int, ...]:
-    """The frames with the most, the median and the fewest lighting computations under the default
-    configuration, of at most 12 evenly spaced ones."""
+def casts_shadows(techniques: Sequence[str]) -> bool:
+    """Do the techniques cast shadows?
+
+    **Raises:** `InputError` where some do and others do not, and for references, which run on the host.
+    """
+    casting = [name for name in techniques if name in SHADOW_NAMES]
+    references = [name for name in casting if name in SHADOW_REFERENCES]
+    if references:
+        raise InputError(
+            f"--techniques {references[0]}: is what others are checked against and is not timed; leave it out."
+        )
+    if casting and len(casting) < len(techniques):
+        other = next(name for name in techniques if name not in casting)
+        raise InputError(
+            f"--techniques {casting[0]},{other}: one casts shadows, the other does not, so that their times cannot be "
+            "compared; tune one kind at a time."
+        )
+    return bool(casting)
+
+
+def choose_frames(setup: SceneSetup, config: Configuration = DEFAULT_CONFIGURATION) -> tuple[int, ...]:
+    """The frames with the most, the median and the least work under a configuration, of at most 12 evenly spaced
+    ones."""
     work = {}
     for frame in setup.counted_frames:
-        counts = cached_counts(DEFAULT_CONFIGURATION, setup.key, frame, functools.partial(_inputs, setup, frame))
-        work[frame] = counts.technique["lighting_computations"]
+        counts = cached_counts(config, setup.key, frame, functools.partial(_inputs, setup, frame))
+        work[frame] = main_work(counts.technique)
     return busiest_frames(work)
 
 

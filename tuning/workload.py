@@ -43,6 +43,7 @@ from vtfs.op_counts import ListLengths, OpCounts
 from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration
 from vtfs.reference import forward_reference, image_error
 from vtfs.shadow_inputs import ShadowScene
+from vtfs.shadow_maps import ShadowMaps, shadow_maps
 from vtfs.techniques import REGISTRY
 from vtfs.view_samples import ViewSamples
 
@@ -172,6 +173,17 @@ class SceneWorkload:
     def cell_maps(self, config: Configuration) -> CellMaps | None:
         """The cells of that frame; None where the technique has none."""
         return cell_maps(config, self._inputs[0])
+
+    def shadow_maps(self, config: Configuration) -> ShadowMaps:
+        """Shadows and tests on that frame."""
+        maps = shadow_maps(config, self._inputs[0])
+        assert maps is not None  # of a shadow technique
+        return maps
+
+    @property
+    def n_shadow_lights(self) -> int:
+        """Lights that cast on that frame."""
+        return len(self._inputs[0].shadows.lights)
 
     def reference(self) -> np.ndarray:
         """The float64 image of the frame with the most work, without shadows."""

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from tuning.space import LARGEST_SPACE, Space, accuracy_values, default_space, load_space
 from vtfs.input_error import InputError
-from vtfs.parameters import TUNED_TECHNIQUES, configuration
+from vtfs.parameters import TECHNIQUES, TUNED_TECHNIQUES, configuration
 
 ALL = TUNED_TECHNIQUES
 
@@ -32,6 +32,14 @@ def test_the_default_space_holds_every_default_once_and_only_exact_settings():
     assert found == default_space(ALL, n_samples=1280 * 720).configurations()
 
 
+def test_the_default_space_of_shadows_has_values_of_its_own():
+    space = default_space(["ptsv", "cluster_hierarchy", "z_fail"], n_samples=1280 * 720)
+    found = space.configurations()
+    assert len(found) == 6 + 12 + 6 and all(config.is_exact for config in found)
+    assert {c["tile_px"] for c in found} == {4, 8, 16}
+    assert all(configuration(technique) in space for technique in space.techniques)
+
+
 @pytest.mark.parametrize(
     ("n_samples", "batches"),
     [(16384, {0}), (16385, {0, 16384}), (65536, {0, 16384}), (65537, {0, 16384, 65536})],
@@ -42,7 +50,8 @@ def test_batches_that_hold_the_whole_frame_are_left_out_as_they_equal_zero(n_sam
 
 def test_accuracy_settings_are_valid_and_none_is_exact():
     for setting in accuracy_values():
-        assert not configuration("tiled_deferred", setting).is_exact
+        technique = "z_fail" if set(setting) <= set(TECHNIQUES["z_fail"]) else "tiled_deferred"
+        assert not configuration(technique, setting).is_exact
 
 
 @given(

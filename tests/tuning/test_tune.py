@@ -123,6 +123,24 @@ def test_view_samples_of_ones_own_renderer(n_frames):
     assert set(result["scene"]["measured_frames"]) <= set(range(n_frames))
 
 
+def test_shadow_techniques_are_tuned_as_others_and_not_among_them():
+    Path("one.toml").write_text("[parameters]\nbranching = [32]\n")
+    ran = tune("--techniques", "cluster_hierarchy", "--shadow-lights", "2", "--budget", "2", space="one.toml")
+    result = result_of(ran)
+    is_complete(result)
+    assert result["kind"] == "shadows" and result["scene"]["shadow_lights"] == 2
+    exact, other = read_measurements(Path("out/measurements.jsonl"))
+    assert exact.error is not None and exact.error < 1e-5 and other.params["front_faces"] == "culled"
+    casting = {"shadow_planes", "shadow_build", "shadow_traverse", "shadow_merge", "shadow_bits"}
+    assert casting | {"assign", "shade_opaque", "frame"} <= set(exact.stages_ms)
+    assert exact.counts[0]["test_and_set"] > 0 and exact.counts[0]["shadow_lights"] == 2
+    assert {picture["kind"] for picture in result["pictures"]} == {"frame", "shadows", "heat_map"}
+    page = Path("out/report.html").read_text()
+    assert "2 of them with shadows" in page and "compared with one another only" in page
+    is_refused(tune("--techniques", "ptsv,forward", out="b"), "ptsv,forward: one casts shadows, the other does not")
+    is_refused(tune("--techniques", "shadow_rays", out="c"), "shadow_rays: is what others are checked against")
+
+
 def test_json_on_stdout_is_all_that_is_printed():
     ran = tune("--budget", "2", "--json", "-")
     assert ran.code == 0 and ran.err == ""

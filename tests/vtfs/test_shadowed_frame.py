@@ -2,6 +2,7 @@
 
 from dataclasses import fields
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -92,6 +93,7 @@ def test_a_technique_makes_the_image_that_the_references_make():
     inputs = a_frame(4, NO_DIRECTIONAL)
     image, expected = (render(c, inputs).astype(np.float64) for c in (CAST, configuration("brute_force")))
     maps = shadow_maps(CAST, inputs)
+    assert maps is not None
     assert 0.05 < maps.shadowed.sum() / maps.lit.sum() < 0.95
     # Pixels in which rounding decides one of three masks: a few of 561.
     off = np.abs(image - expected).max(axis=-1) > 1e-4 * expected.mean()
@@ -126,7 +128,7 @@ def test_bits_of_a_layer_lie_at_its_own_runs():
     rng = np.random.default_rng(0)
     masks = rng.random((n_views, 2, n_visible, 32)) < 0.5
     found = shadow_bits(
-        [CastMask(m, np.bool_(False)) for m in masks.reshape(-1, n_visible, 32)], inputs.shadows.slots, layers
+        [CastMask(jnp.asarray(m), jnp.bool_(False)) for m in masks.reshape(-1, n_visible, 32)], inputs.shadows.slots, layers
     )
     words = np.asarray(found.shadowed)
     assert (words[:n_visible] == masks[0, 0] + 2 * masks[0, 1]).all()

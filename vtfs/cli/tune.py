@@ -14,7 +14,14 @@ from vtfs.cli.options import JsonOption, VerboseOption, check_folder, set_log_le
 from vtfs.cli.scene_arguments import SceneArguments, with_scene
 from vtfs.cli.status import Status
 from vtfs.input_error import InputError
-from vtfs.parameters import TECHNIQUES, TUNED_TECHNIQUES, configuration, default_value
+from vtfs.parameters import (
+    SHADOW_NAMES,
+    SHADOW_REFERENCES,
+    TECHNIQUES,
+    TUNED_TECHNIQUES,
+    configuration,
+    default_value,
+)
 
 
 @with_scene
@@ -23,7 +30,8 @@ def tune(
     techniques: Annotated[
         str | None,
         typer.Option(
-            help="Comma-separated, or `all`; those that counting finds hopeless are not measured.",
+            help="Comma-separated, `all` many-light ones, or `shadows`; those that counting finds hopeless are not "
+            "measured.",
             metavar="A,B",
             show_default=", ".join(TUNED_TECHNIQUES),
         ),
@@ -81,12 +89,13 @@ def tune(
     setup = scene.set_up()
     keep_compiled_programs()
     from reports.page import write_report
-    from tuning.tune import DEFAULT_BUDGET, TuneOptions, tune
+    from tuning.tune import DEFAULT_BUDGET, TuneOptions, casts_shadows, tune
 
+    casts_shadows(names)  # refuses what cannot be compared
     options = TuneOptions(
         out,
         names,
-        names if techniques and techniques.strip() != "all" else (),
+        names if techniques and techniques.strip() not in _GROUPS else (),
         own_space,
         budget_parsed or DEFAULT_BUDGET,
         objective,
@@ -104,11 +113,17 @@ def tune(
         print(f"Report: {page}")
 
 
+_GROUPS = {
+    "all": tuple(name for name in TECHNIQUES if name not in SHADOW_NAMES),
+    "shadows": tuple(name for name in SHADOW_NAMES if name not in SHADOW_REFERENCES),
+}
+
+
 def _technique_names(given: str | None) -> tuple[str, ...]:
     if given is None:
         return TUNED_TECHNIQUES
-    if given.strip() == "all":
-        return tuple(TECHNIQUES)
+    if given.strip() in _GROUPS:
+        return _GROUPS[given.strip()]
     names = tuple(dict.fromkeys(name.strip() for name in given.split(",") if name.strip()))
     for name in names or ("",):
         configuration(name)  # refuses what is unknown
