@@ -12,9 +12,12 @@ from tests.strategies import (
     adversarial_lights,
     layered_samples,
     nearby_lights,
+    random_samples,
     seeds,
     surface_samples,
+    through,
 )
+from vtfs.camera import Lens
 from vtfs.frame import FrameInputs, count, run_stages
 from vtfs.gbuffer import from_runs
 from vtfs.light_volumes import lights_of_samples
@@ -108,3 +111,20 @@ def test_a_gbuffer_is_read_per_light_or_per_sample():
     assert counts["deferred_stencil"]["bytes_gbuffer_32"] == 68 * (n_samples + pairs)
     assert counts["tiled_deferred"]["bytes_gbuffer_16"] == 36 * 2 * n_samples
     assert counts["tiled_forward_prez"]["bytes_gbuffer_32"] == 0
+
+
+@pytest.mark.parametrize("lens", [Lens(), Lens(orthographic_height_m=7.5)], ids=["perspective", "parallel"])
+@pytest.mark.parametrize("technique", ["deferred", "deferred_stencil"])
+def test_a_light_that_just_reaches_a_sample_shades_it(technique, lens):
+    """Lights that end less than a millionth of their range behind a sample."""
+    config = configuration(technique, {"batch": BATCH})
+    for seed in range(8):
+        samples = through(random_samples(a_camera(near_m=0.1, far_m=1.0), seed), lens)
+        lights = adversarial_lights(samples, 37, ("touching",), seed)
+        env, _ = run_stages(config, FrameInputs(samples, lights), until="assign")
+        n_runs, pixels = env["positions"].n_visible_runs, env["assign"]
+        light, run, mask = (np.asarray(c)[: int(pixels.total)] for c in (pixels.light, pixels.run, pixels.mask))
+        covered = np.zeros((n_runs, 32, 37), bool)
+        covered[run, :, light] = (mask[:, None] >> np.arange(32, dtype=np.uint32)) & 1 == 1
+        image = np.stack([from_runs(covered[..., n], SMALL) for n in range(37)], axis=-1)
+        assert image[oracles.windows(samples, lights) > 0].all()
