@@ -1,14 +1,19 @@
-"""The scenes of the shadow benchmark: rolling ground with clumps of leaf triangles, of any triangle count."""
+"""The cases of the shadow benchmarks: views of scenes, and rolling ground with clumps of leaf triangles."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from vtfs.camera import Camera, CameraPath, Pose, Viewport
-from vtfs.scene import Material, Scene
-from vtfs.shadow_casters import ShadowLight
+from vtfs.camera import Camera, CameraPath, Pose, Viewport, load_cameras
+from vtfs.gallery import GALLERY, build_scene
+from vtfs.scene import Material, Scene, load_scene
+from vtfs.shadow_casters import Casters, ShadowLight
+from vtfs.shadow_mask import default_bias_m, facing_samples
+from vtfs.view_samples import ViewSamples, trace_view_samples
 
 LIGHT = ShadowLight((10.0, 30.0, -20.0))
 
@@ -51,3 +56,42 @@ def at_size(camera: Camera, size_px: int) -> Camera:
         camera.eye_m, camera.target_m, camera.up, camera.fov_y_deg, camera.near_m,
         camera.far_m if math.isfinite(camera.far_m) else 1e4, Viewport(size_px, size_px),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """One view of one scene with one light."""
+
+    name: str
+    samples: ViewSamples
+    casters: Casters
+    light: ShadowLight
+    receives: np.ndarray
+    bias_m: float
+
+
+def read_case(scene_name: str, cameras: str | None, n_triangles: int, along: float, size_px: int) -> Case:
+    """A view of the clumps, of a built-in scene or of a file, at a share `along` of its path.
+
+    All triangles that are not blended cast, masked ones as if they were solid. The samples of the clumps are all
+    tested, as by the rays that they are compared with, elsewhere those that face the light.
+    """
+    if scene_name == "clumps":
+        scene = clumps_scene(n_triangles)
+    elif scene_name in GALLERY:
+        scene = build_scene(scene_name, n_triangles)
+    else:
+        scene = load_scene(Path(scene_name))
+    path = load_cameras(Path(cameras)) if cameras else scene.cameras
+    if path is None:
+        raise SystemExit(f"{scene_name}: has no cameras; give --cameras FILE.")
+    frame = int(along * len(path.poses))
+    samples = trace_view_samples(scene, at_size(path.camera(frame), size_px))
+    low, high = scene.bounds_m
+    in_scene = ShadowLight(tuple(low + (high - low) * np.array([0.45, 0.8, 0.55])))
+    light = LIGHT if scene_name == "clumps" else in_scene
+    is_solid = np.array([material.alpha_mode != "blend" for material in scene.materials])
+    casters = Casters(scene.vertices_m, scene.triangles[is_solid[scene.material_index]])
+    receives = samples.valid if scene_name == "clumps" else facing_samples(samples, light)
+    name = f"{scene.name} ({casters.n_triangles:,} triangles, {size_px} squared)"
+    return Case(name, samples, casters, light, receives, default_bias_m(casters))

@@ -1,9 +1,10 @@
 """Shadow techniques against branching, tile size and Embree: time, tests and errors of every variant.
 
 python -m benchmarks.shadows --out DIR [--scene clumps|BUILT_IN|FILE] [--triangles 60000]
-    [--cameras FILE] [--frame 0] [--size 1024] [--minutes 8] [--variants cross|all|quick]
+    [--cameras FILE] [--along 0] [--size 1024] [--minutes 8] [--variants cross|all|quick] [--workers 1]
 
-One process. A configuration that fails, or for which no time is left, is a line of the table too. Each program runs
+One process; `workers` threads compile. With warp-lang 1.19 installed and a GPU, its shadow rays run beside. A
+configuration that fails, or for which no time is left, is a line of the table too. Each program runs
 from view samples to mask: clusters, hierarchy, planes, walk and merge; vertices, triangles and samples are on the
 device, nothing else is made before. Errors are samples outside the bands of `shadow_references.classify`, on at most
 2,000 samples drawn at random and on all that differ from Embree.
@@ -12,68 +13,34 @@ device, nothing else is made before. Errors are samples outside the bands of `sh
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
-from benchmarks.shadow_cases import LIGHT, at_size, clumps_scene
-from vtfs.camera import load_cameras
+from benchmarks.shadow_cases import Case, read_case
 from vtfs.device import device_name, keep_compiled_programs, versions
 from vtfs.files import write_atomically
-from vtfs.gallery import GALLERY, build_scene
 from vtfs.gbuffer import from_runs
-from vtfs.scene import load_scene
-from vtfs.shadow_casters import Casters, ShadowLight, opaque_casters
-from vtfs.shadow_mask import ShadowPlan, casters_on_device, default_bias_m, facing_samples, shadow_frame
+from vtfs.shadow_mask import CastersOnDevice, ShadowFrame, ShadowMask, ShadowPlan, casters_on_device, shadow_frame
 from vtfs.shadow_references import ShadowRays, brute_force, classify, view_points_m
 from vtfs.shadow_techniques import fitted, run_program, shadow_counts, shadow_grid, shadow_program
-from vtfs.view_samples import ViewSamples, trace_view_samples
 
 N_CHECKED, N_CLASSIFIED = 2_000, 400
 BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (8, 16, 4, 32, 2)
 
 
-@dataclass(frozen=True)
-class Case:
-    """One view of one scene with one light."""
-
-    name: str
-    samples: ViewSamples
-    casters: Casters
-    light: ShadowLight
-    receives: np.ndarray
-    bias_m: float
-
-
-def read_case(arguments: argparse.Namespace) -> Case:
-    if arguments.scene == "clumps":
-        scene, light = clumps_scene(arguments.triangles), LIGHT
-    elif arguments.scene in GALLERY:
-        scene, light = build_scene(arguments.scene, arguments.triangles), None
-    else:
-        scene, light = load_scene(Path(arguments.scene)), None
-    path = load_cameras(Path(arguments.cameras)) if arguments.cameras else scene.cameras
-    if path is None:
-        raise SystemExit(f"{arguments.scene}: has no cameras; give --cameras FILE.")
-    samples = trace_view_samples(scene, at_size(path.camera(arguments.frame), arguments.size))
-    if light is None:
-        low, high = scene.bounds_m
-        light = ShadowLight(tuple(low + (high - low) * np.array([0.45, 0.8, 0.55])))
-    casters = opaque_casters(scene)
-    # The case of the rays tests every valid sample; elsewhere those that face the light.
-    receives = samples.valid if arguments.scene == "clumps" else facing_samples(samples, light)
-    name = f"{scene.name} ({casters.n_triangles:,} triangles, {arguments.size} squared)"
-    return Case(name, samples, casters, light, receives, default_bias_m(casters))
-
-
 def variants(which: str) -> Iterator[tuple[str, ShadowPlan]]:
     """The most telling first: what comes late may find no time left."""
     yield "cluster_hierarchy", ShadowPlan(8, 8)
+    yield "cluster_hierarchy", ShadowPlan(8, 16)
     yield "ptsv", ShadowPlan(8, 8, extra="silhouette")
     if which == "quick":
         return
@@ -82,7 +49,9 @@ def variants(which: str) -> Iterator[tuple[str, ShadowPlan]]:
     yield "cluster_hierarchy", ShadowPlan(8, 8, extra="off")
     yield "cluster_hierarchy", ShadowPlan(8, 8, feedback=False)
     yield "cluster_hierarchy", ShadowPlan(8, 8, bounds="implicit")
-    crossed = [(8, b) for b in BRANCHINGS if b not in (8, 32)] + [(tile_px, 8) for tile_px in TILES if tile_px != 8]
+    yield "cluster_hierarchy", ShadowPlan(8, 8, passes=2)
+    yield "cluster_hierarchy", ShadowPlan(8, 8, tree="full")
+    crossed = [(8, b) for b in BRANCHINGS if b not in (8, 16, 32)] + [(tile_px, 8) for tile_px in TILES if tile_px != 8]
     rest = [(tile_px, b) for tile_px in TILES for b in BRANCHINGS if tile_px != 8 and b != 8]
     for tile_px, branching in crossed + (rest if which == "all" else []):
         yield "cluster_hierarchy", ShadowPlan(tile_px, branching)
@@ -110,19 +79,34 @@ def embree(case: Case) -> tuple[dict, np.ndarray]:
     return {"build_ms": build_ms, "query_ms": float(np.median(times)), "rays": len(points)}, answers
 
 
-def measure(case: Case, technique: str, plan: ShadowPlan, by_rays: np.ndarray) -> dict:
-    """Time, counts and errors of one configuration."""
+@dataclass(frozen=True)
+class Prepared:
+    """A configuration with capacities that fit, counted and compiled."""
+
+    plan: ShadowPlan
+    frame: ShadowFrame
+    counted: ShadowMask
+    program: Any
+    seconds: float
+
+
+def prepare(case: Case, casters: CastersOnDevice, technique: str, plan: ShadowPlan) -> Prepared:
     started = time.perf_counter()
     grid = shadow_grid(case.samples, plan.tile_px)
-    casters = casters_on_device(case.casters)
     frame = shadow_frame(case.samples, casters, case.light, grid, case.bias_m, case.receives)
     plan = fitted(technique, plan, frame)
     counted = run_program(technique, plan, frame)
     with jax.enable_x64(True):
         program = shadow_program(technique, plan)
-        shadowed, overflowed = jax.block_until_ready(program(frame))
-        prepared_s = time.perf_counter() - started
-        times = times_ms(lambda: program(frame))
+        jax.block_until_ready(program(frame))
+    return Prepared(plan, frame, counted, program, time.perf_counter() - started)
+
+
+def measure(case: Case, ready: Prepared, by_rays: np.ndarray) -> dict:
+    """Time, counts and errors of one configuration."""
+    with jax.enable_x64(True):
+        shadowed, overflowed = jax.block_until_ready(ready.program(ready.frame))
+        times = times_ms(lambda: ready.program(ready.frame))
     assert not bool(overflowed)
     mask = from_runs(np.asarray(shadowed), case.samples.camera.viewport)[case.receives]
     points, eye = view_points_m(case.samples, case.receives), np.array(case.samples.camera.eye_m)
@@ -136,14 +120,14 @@ def measure(case: Case, technique: str, plan: ShadowPlan, by_rays: np.ndarray) -
         "outcome": "timed",
         "time_ms": float(np.median(times)),
         "times_ms": times,
-        "prepared_s": prepared_s,
+        "prepared_s": ready.seconds,
         "differ_from_rays": len(differs),
         "checked": len(some),
         "near_edge": found.near_edge,
         "near_plane": found.near_plane,
         "errors": found.errors,
-        "counts": shadow_counts(counted, frame, plan),
-        "capacities": asdict(plan),
+        "counts": shadow_counts(ready.counted, ready.frame, ready.plan),
+        "capacities": asdict(ready.plan),
     }
 
 
@@ -153,36 +137,50 @@ def main() -> None:
     parser.add_argument("--scene", default="clumps")
     parser.add_argument("--triangles", type=int, default=60_000)
     parser.add_argument("--cameras")
-    parser.add_argument("--frame", type=int, default=0)
+    parser.add_argument("--along", type=float, default=0.0)
     parser.add_argument("--size", type=int, default=1024)
     parser.add_argument("--minutes", type=float, default=8.0)
     parser.add_argument("--variants", choices=("cross", "all", "quick"), default="cross")
+    parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
     end = time.monotonic() + 60 * arguments.minutes
     keep_compiled_programs()
-    case = read_case(arguments)
+    case = read_case(arguments.scene, arguments.cameras, arguments.triangles, arguments.along, arguments.size)
     rays, by_rays = embree(case)
     record = {"scene": case.name, "device": device_name(), "versions": versions(), "embree": rays, "results": []}
     print(f"{case.name}, {device_name()}: {rays['rays']:,} samples, {by_rays.mean():.1%} in shadow", flush=True)
     print(f"embree robust: build {rays['build_ms']:.1f} ms, rays {rays['query_ms']:.1f} ms")
+    if importlib.util.find_spec("warp"):
+        from benchmarks.peers.warp_shadows import warp_rays
+
+        record["warp"] = warp_rays(case, by_rays)
+        print(f"warp: {record['warp']}", flush=True)
+    casters = casters_on_device(case.casters)
+    chosen = list(variants(arguments.variants))
+    results: list[dict] = [{"technique": technique, "plan": asdict(plan)} for technique, plan in chosen]
+    # Programs are compiled side by side, and timed when nothing else runs.
+    with ThreadPoolExecutor(arguments.workers) as pool:
+        jobs = [pool.submit(prepare, case, casters, *variant) for variant in chosen]
+        wait(jobs, timeout=max(0.8 * (end - time.monotonic()), 1.0))
+        for job in jobs:
+            job.cancel()
+        wait([job for job in jobs if not job.cancelled()])
+    out = arguments.out / f"shadows-{case.name.split(' (')[0].replace(' ', '-')}.json"
     print(
         f"{'technique':<18}{'tile':>5}{'b':>4}  {'variant':<28}{'ms':>9}{'M tests':>9}{'M node':>8}"
         f"{'errors':>7}{'bands':>6}"
     )
-    out = arguments.out / f"shadows-{case.name.split(' (')[0].replace(' ', '-')}.json"
-    longest_s = 0.0
-    for technique, plan in variants(arguments.variants):
+    for (technique, plan), job, result in zip(chosen, jobs, results, strict=True):
         bounds = "depths" if technique == "ptsv" else plan.bounds
-        label = f"{bounds} {plan.extra} {'' if plan.feedback else 'no feedback'}"
+        trees = f"{'' if plan.tree == 'compact' else 'full '}{'' if plan.passes == 1 else 'two passes '}"
+        label = f"{bounds} {plan.extra} {trees}{'' if plan.feedback else 'no feedback'}"
         head = f"{technique:<18}{plan.tile_px:>5}{plan.branching:>4}  {label:<28}"
-        result: dict = {"technique": technique, "plan": asdict(plan)}
-        started = time.monotonic()
-        if started + longest_s > end:
+        if job.cancelled() or time.monotonic() > end:
             result |= {"outcome": "no time left"}
             print(f"{head}no time left", flush=True)
         else:
             try:
-                result |= measure(case, technique, plan, by_rays)
+                result |= measure(case, job.result(), by_rays)
                 counts = result["counts"]
                 print(
                     f"{head}{result['time_ms']:>9.2f}{counts['test_and_set'] / 1e6:>9.2f}"
@@ -196,7 +194,6 @@ def main() -> None:
                     "error": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
                 }
                 print(f"{head}failed: {result['error'][:90]}", flush=True)
-            longest_s = max(longest_s, time.monotonic() - started)
         record["results"].append(result)
         write_atomically(out, json.dumps(record, indent=1).encode())
     print(out)

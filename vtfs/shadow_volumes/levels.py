@@ -147,12 +147,8 @@ def _split_level(
     table, absent, b = hierarchy.table, volume.safe.shape[0], plan.branching
     bias_m = volume.bias_m.astype(jnp.float32)
 
-    def rows_of(node):
-        return table.row.at[first_row + node].get(mode="promise_in_bounds")
-
-    def by_lanes(triangle, node):
-        """All children and triangles of a group side by side: vectors of a CPU."""
-        row = rows_of(node)
+    def test(triangle, node):
+        row = table.row.at[first_row + node].get(mode="promise_in_bounds")
         planes = jax.tree.map(lambda c: c[:, None, :], volume.nodes.at(triangle))
         boxes = tuple(row[:, c, :, None] for c in range(6))
         refined, goes_on, accepted = test_nodes(planes, boxes, hierarchy.is_frustum, bias_m)
@@ -165,32 +161,9 @@ def _split_level(
         extra = jnp.where(only, 0, jnp.sum(refined, dtype=jnp.int32))
         return both & jnp.uint32(2**LANES - 1), both >> LANES, extra
 
-    def by_children(triangle, node):
-        """All children of a triangle side by side: threads of a GPU that load the same planes, one after another in
-        the boxes."""
-        width = min(b, 32)
-        row = rows_of(node)
-        planes = jax.tree.map(lambda c: c[:, :, None], volume.nodes.at(triangle))
-        boxes = tuple(row[:, c, None, :] for c in range(6))
-        refined, goes_on, accepted = test_nodes(planes, boxes, hierarchy.is_frustum, bias_m)
-        pass_on = jnp.zeros((1, 1, b), bool).at[..., 0].set(True) & (triangle != absent)[:, :, None]
-        goes_on, accepted = jnp.where(only, pass_on, goes_on), accepted & ~only
-        child = jnp.arange(b, dtype=jnp.uint64) % width
-        both = (goes_on.astype(jnp.uint64) << child) | (accepted.astype(jnp.uint64) << (child + 32))
-        both = both.reshape(*both.shape[:2], b // width, width)
-        both = jax.lax.reduce(both, jnp.uint64(0), jax.lax.bitwise_or, (3,))
-        # From bits of children, by triangle, to bits of triangles, by child.
-        bit = jnp.arange(width, dtype=jnp.uint64)[:, None]
-        lane = jnp.arange(LANES, dtype=jnp.uint32)
-        words = both.transpose(0, 2, 1)[:, :, None, :] >> bit
-        bits = (words & 1).astype(jnp.uint32) << lane | (words >> 32 & 1).astype(jnp.uint32) << (lane + LANES)
-        both = jnp.sum(bits, axis=-1, dtype=jnp.uint32).reshape(-1, b)
-        extra = jnp.where(only, 0, jnp.sum(refined, dtype=jnp.int32))
-        return both & jnp.uint32(2**LANES - 1), both >> LANES, extra
-
     if plan.level_groups:
-        return split_at_once(lists, by_children, drop, b, lanes, absent, capacity)
-    return split(lists, by_lanes, drop, b, lanes, absent, capacity, chunk)
+        return split_at_once(lists, test, drop, b, lanes, absent, capacity)
+    return split(lists, test, drop, b, lanes, absent, capacity, chunk)
 
 
 def _with_level(
