@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,7 @@ from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_cou
 from vtfs.device import versions
 from vtfs.files import write_atomically
 from vtfs.frame import FrameInputs
-from vtfs.input_error import InputError
-from vtfs.parameters import SHADOW_NAMES, SHADOW_REFERENCES, Configuration, configuration
+from vtfs.parameters import Configuration, casts_shadows, configuration
 from vtfs.scene_setup import SceneSetup
 
 DEFAULT_BUDGET = Budget(seconds=40.0)
@@ -149,26 +148,6 @@ def tune(
     }
     write_atomically(options.out / "result.json", json.dumps(result, indent=1, allow_nan=False).encode())
     return result
-
-
-def casts_shadows(techniques: Sequence[str]) -> bool:
-    """Do the techniques cast shadows?
-
-    **Raises:** `InputError` where some do and others do not, and for references, which run on the host.
-    """
-    casting = [name for name in techniques if name in SHADOW_NAMES]
-    references = [name for name in casting if name in SHADOW_REFERENCES]
-    if references:
-        raise InputError(
-            f"--techniques {references[0]}: is what others are checked against and is not timed; leave it out."
-        )
-    if casting and len(casting) < len(techniques):
-        other = next(name for name in techniques if name not in casting)
-        raise InputError(
-            f"--techniques {casting[0]},{other}: one casts shadows, the other does not, so that their times cannot be "
-            "compared; tune one kind at a time."
-        )
-    return bool(casting)
 
 
 def choose_frames(setup: SceneSetup, config: Configuration = DEFAULT_CONFIGURATION) -> tuple[int, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from vtfs.input_error import InputError
@@ -337,6 +337,26 @@ def configuration(technique: str, params: Mapping[str, object] | None = None) ->
     }
     settled = _settled(technique, parsed)
     return Configuration(technique, tuple((name, settled[name]) for name in names))
+
+
+def casts_shadows(techniques: Sequence[str]) -> bool:
+    """Do the techniques cast shadows?
+
+    **Raises:** `InputError` where some do and others do not, and for references, which run on the host.
+    """
+    casting = [name for name in techniques if name in SHADOW_NAMES]
+    references = [name for name in casting if name in SHADOW_REFERENCES]
+    if references:
+        raise InputError(
+            f"--techniques {references[0]}: is what others are checked against and is not timed; leave it out."
+        )
+    if casting and len(casting) < len(techniques):
+        other = next(name for name in techniques if name not in casting)
+        raise InputError(
+            f"--techniques {casting[0]},{other}: one casts shadows, the other does not, so that their times cannot be "
+            "compared; tune one kind at a time."
+        )
+    return bool(casting)
 
 
 def changes_shadows(config: Configuration) -> bool:

@@ -19,6 +19,7 @@ from vtfs.parameters import (
     SHADOW_REFERENCES,
     TECHNIQUES,
     TUNED_TECHNIQUES,
+    casts_shadows,
     configuration,
     default_value,
 )
@@ -68,6 +69,7 @@ def tune(
     """The main job: count, measure, model, search, report."""
     set_log_level(verbose)
     names = _technique_names(techniques)
+    casts_shadows(names)  # refuses what cannot be compared
     if objective not in ("max", "mean"):
         raise InputError(f"--objective {objective}: must be max or mean.")
     if max_error is not None and not max_error >= 0:
@@ -89,9 +91,8 @@ def tune(
     setup = scene.set_up()
     keep_compiled_programs()
     from reports.page import write_report
-    from tuning.tune import DEFAULT_BUDGET, TuneOptions, casts_shadows, tune
+    from tuning.tune import DEFAULT_BUDGET, TuneOptions, tune
 
-    casts_shadows(names)  # refuses what cannot be compared
     options = TuneOptions(
         out,
         names,
