@@ -11,10 +11,12 @@ matter. Scenes and lights are those of the tests, adversarial ones; with other s
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import math
 import time
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -149,19 +151,28 @@ def listed_at(config: Configuration, inputs: FrameInputs) -> tuple[np.ndarray, i
         total = int(lists.total)
         light, run, mask = (np.asarray(c)[:total] for c in (lists.light, lists.run, lists.mask))
         covered = np.zeros((len(np.asarray(env["positions"].place)), 32, inputs.n_lights), bool)
-        np.logical_or.at(covered, (run, slice(None), light), (mask[:, None] >> np.arange(32, dtype=np.uint32)) & 1 == 1)
-        rows, columns = np.moveaxis(oracles.run_pixels(inputs.viewport), -1, 0)
-        inside = (rows < inputs.viewport.height_px) & (columns < inputs.viewport.width_px)
-        at = np.zeros((*samples.valid.shape, inputs.n_lights), bool)
-        at[rows[inside], columns[inside]] = covered[: len(rows)][inside]
-        return at[samples.valid], total
+        # A light has a run once, so that no place is written twice.
+        covered[run, :, light] = (mask[:, None] >> np.arange(32, dtype=np.uint32)) & 1 == 1
+        return as_image(covered, inputs.viewport)[samples.valid], total
     clusters = env["clusters"]
     count, index = np.asarray(lists.count), np.asarray(lists.index)
     table = np.zeros((len(count), inputs.n_lights), bool)
     table[np.repeat(np.arange(len(count)), count), index[: int(lists.total)]] = True
     cluster = np.asarray(clusters.block_cluster)[np.asarray(clusters.block_of_sample)]
     n_visible = env["positions"].n_visible_runs
-    return table[oracles.as_image(cluster[:n_visible], inputs.viewport)[samples.valid]], int(lists.total)
+    return table[as_image(cluster[:n_visible], inputs.viewport)[samples.valid]], int(lists.total)
+
+
+run_pixels = functools.cache(oracles.run_pixels)  # a loop over pixels
+
+
+def as_image(runs: np.ndarray, viewport: Viewport) -> np.ndarray:
+    """`[runs, 32, ...]` to `[h, w, ...]`."""
+    rows, columns = np.moveaxis(run_pixels(viewport), -1, 0)
+    inside = (rows < viewport.height_px) & (columns < viewport.width_px)
+    image = np.zeros((viewport.height_px, viewport.width_px, *runs.shape[2:]), runs.dtype)
+    image[rows[inside], columns[inside]] = runs[: len(rows)][inside]
+    return image
 
 
 def check(
@@ -179,7 +190,7 @@ def check(
         print(f"MISSED {missed.sum()}: {name}, {config}: valid sample {sample}, light {light}", flush=True)
 
 
-def configured(case: tuple[str, dict[str, Value]], grid: dict[str, Value]) -> Configuration:
+def configured(case: tuple[str, dict[str, Value]], grid: Mapping[str, Value]) -> Configuration:
     technique, params = case
     if "deferred_stencil" in technique or technique == "deferred":
         return configuration(technique, params)
@@ -188,9 +199,10 @@ def configured(case: tuple[str, dict[str, Value]], grid: dict[str, Value]) -> Co
     return configuration(technique, {**params, **grid})
 
 
-def campaign(n_scenes: int, first: int) -> None:
+def campaign(n_scenes: int, first: int, seconds: float) -> None:
+    """All scenes, or as many as the time allows."""
     tallies: dict[str, Tally] = defaultdict(Tally)
-    began = time.perf_counter()
+    began, n_done = time.perf_counter(), 0
     for seed in range(first, first + n_scenes):
         samples, lights = draw_scene(seed)
         inputs, reaches = FrameInputs(samples, lights), reaching(samples, lights)
@@ -208,7 +220,10 @@ def campaign(n_scenes: int, first: int) -> None:
             print(
                 f"<!-- {seed + 1 - first} scenes, {time.perf_counter() - began:.0f} s, {missed} missed -->", flush=True
             )
-    report(f"{n_scenes:,} random scenes", tallies)
+        n_done = seed + 1 - first
+        if time.perf_counter() - began > seconds:
+            break
+    report(f"{n_done:,} random scenes from {first}", tallies)
 
 
 def report(title: str, tallies: dict[str, Tally]) -> None:
@@ -342,11 +357,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=10_000)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="end the campaign after so long")
     parser.add_argument("--only", default="campaign,pitfalls,frustum")
     asked = parser.parse_args()
     for name in asked.only.split(","):
         if name == "campaign":
-            campaign(asked.scenes, asked.first)
+            campaign(asked.scenes, asked.first, asked.seconds)
         else:
             {"pitfalls": pitfalls, "frustum": frustum}[name]()
 

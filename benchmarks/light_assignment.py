@@ -1,10 +1,11 @@
 """Light assignment from 32 to millions of lights: every assigner, the sorts and the stages of a tree's build.
 
-python benchmarks/light_assignment.py [--lights 32,1024,...] [--only NAME] [--full] [--bevy PATH]
+python benchmarks/light_assignment.py [--lights 32,1024,...] [--only NAME] [--full] [--warp] [--bevy PATH]
 
 Without a peer: 1920x1080, 32-pixel tiles, self-similar slices, near 0.1 m, far 200 m, a surface in about 15,600
 clusters, lights in the box of the surface with 20 of them at a median sample. `--full` times the whole update as well:
-clusters, build and assignment in one program.
+clusters, build and assignment in one program. `--warp` times NVIDIA Warp on the same lights and boxes
+(`peers/warp_lights.py`).
 
 With `--bevy PATH` (a program built from `peers/bevy_clusters`, never part of this project): its 30 x 17 x 24 grid with
 every cell occupied, its lights (4 m, uniform over depth and screen), and its CPU clustering between our runs.
@@ -21,6 +22,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -70,6 +72,16 @@ def median_ms(run: Callable[[], object], least_s: float = 0.2, repeats: int = 5)
     return float(np.median(times)) * 1e3
 
 
+def on_arrays(function: Callable[..., object], *arguments: object) -> tuple[Callable[[], list[jax.Array]], Any]:
+    """The program with its arguments, as one calls it who holds the arrays; and how to make its result of them.
+
+    Packing and unpacking our records takes Python 0.1 ms a call.
+    """
+    leaves, tree = jax.tree.flatten(arguments)
+    program = jax.jit(lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves))))
+    return partial(program, *leaves), jax.tree.structure(jax.eval_shape(function, *arguments))
+
+
 def surface_positions(camera: Camera) -> Positions:
     """A floor, a far wall and many small boxes before them: one smooth depth a box, with steps between."""
     rng = np.random.default_rng(0)
@@ -108,7 +120,7 @@ def fitting_capacity(assign: Callable[[int], LightLists]) -> int:
 
 def assigners(capacity: int, only: str) -> dict[str, Callable[[Sphere, Clusters], LightLists]]:
     """From lights and clusters to lists, with whatever is built on the way. Chunks are 2^19 tests on a CPU."""
-    words = 2**14 if on_cpu() else 2**22
+    words = 2**14 if on_cpu() else 2**23
     found: dict[str, Callable[[Sphere, Clusters], LightLists]] = {
         f"coarse to fine, b={b}": lambda s, c, b=b: assign_coarse_to_fine(s, c, capacity, words, b)[0] for b in (16, 32)
     }
@@ -125,7 +137,7 @@ def time_assigners(
     """Every assigner, checked against the first; and the capacity of the pairs."""
     n_lights, n_clusters = lights.x_m.shape[0], int(clusters.n_clusters)
     first = jax.jit(
-        lambda s, c, capacity: assign_coarse_to_fine(s, c, capacity, 2**14 if on_cpu() else 2**22), static_argnums=2
+        lambda s, c, capacity: assign_coarse_to_fine(s, c, capacity, 2**14 if on_cpu() else 2**23), static_argnums=2
     )
     capacity = fitting_capacity(lambda capacity: first(lights, clusters, capacity)[0])
     lists, counts = first(lights, clusters, capacity)
@@ -141,15 +153,15 @@ def time_assigners(
     for name, assign in assigners(capacity, only).items():
         if name == "brute force" and n_lights * n_clusters > brute_force_tests:
             continue
-        program = jax.jit(assign)
+        run, tree = on_arrays(assign, lights, clusters)
         started = time.perf_counter()
-        result = jax.block_until_ready(program(lights, clusters))
+        result = jax.tree.unflatten(tree, jax.block_until_ready(run()))
         compile_s = time.perf_counter() - started
         if bool(result.overflowed):
             print(f"  {name}: a level does not fit the capacity of the pairs", flush=True)
             continue
         differing = int(np.abs(np.asarray(result.count) - np.asarray(lists.count)).sum())
-        found[name] = median_ms(partial(program, lights, clusters))
+        found[name] = median_ms(run)
         print(f"  {name}: {found[name]:.3f} ms, first call {compile_s:.1f} s, other pairs {differing}", flush=True)
         between()
     return found, capacity
@@ -176,13 +188,13 @@ def time_stages(lights: Sphere) -> Times:
     return found
 
 
-def view_benchmark(counts: list[int], only: str, full: bool) -> None:
+def view_benchmark(counts: list[int], only: str, full: bool, warp: bool) -> None:
     camera = Camera((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 60.0, NEAR_M, FAR_M, VIEWPORT)
     positions, grid = surface_positions(camera), jax.device_put(cluster_grid(camera, TILE_PX, 0, FAR_M))
-    form = jax.jit(lambda p, g: form_clusters(p, g, "implicit", CELLS, CLUSTERS))
-    clusters = form(positions, grid)
+    form, tree = on_arrays(lambda p, g: form_clusters(p, g, "implicit", CELLS, CLUSTERS), positions, grid)
+    clusters = jax.tree.unflatten(tree, form())
     assert not bool(clusters.overflowed)
-    print(f"clusters: {int(clusters.n_clusters):,} occupied, {median_ms(partial(form, positions, grid)):.3f} ms")
+    print(f"clusters: {int(clusters.n_clusters):,} occupied, {median_ms(form):.3f} ms")
     # The clusters by themselves: blocks are of no use here, and their capacity is larger.
     n = 2 ** (int(clusters.n_clusters) - 1).bit_length()
     own = jax.tree.map(lambda a: a[:n] if a.ndim == 1 and a.shape[0] == CLUSTERS else a, clusters)
@@ -190,13 +202,27 @@ def view_benchmark(counts: list[int], only: str, full: bool) -> None:
     for n_lights in counts:
         lights = lights_around(positions, n_lights)
         table[n_lights], capacity = time_assigners(lights, own, only)
-        table[n_lights] |= time_stages(lights)
+        table[n_lights] |= time_warp_beside(lights, own) if warp else time_stages(lights)
         if full:
             for name, assign in assigners(capacity, only).items():
                 if name != "brute force":
-                    update = jax.jit(lambda s, p, g, assign=assign: _update(assign, n, s, p, g))
-                    table[n_lights][f"update, {name}"] = median_ms(partial(update, lights, positions, grid))
+                    update, _ = on_arrays(partial(_update, assign, n), lights, positions, grid)
+                    table[n_lights][f"update, {name}"] = median_ms(update)
     print_table(table)
+
+
+def time_warp_beside(lights: Sphere, clusters: Clusters) -> Times:
+    from benchmarks.peers.warp_lights import time_warp
+
+    n, box = int(clusters.n_clusters), clusters.box
+    low, high = (
+        np.stack([np.asarray(c)[:n] for c in corner], axis=1)
+        for corner in ((box.low_x_m, box.low_y_m, box.low_z_m), (box.high_x_m, box.high_y_m, box.high_z_m))
+    )
+    rows = np.stack([np.asarray(c) for c in (lights.x_m, lights.y_m, lights.z_m, lights.radius_m)], axis=1)
+    times, lengths = time_warp(rows, low, high)
+    print(f"  Warp: {int(lengths.sum(dtype=np.int64)):,} pairs, {times}", flush=True)
+    return times
 
 
 def _update(assign, n: int, lights: Sphere, positions: Positions, grid: ClusterGrid):
@@ -212,8 +238,20 @@ def dense_clusters() -> Clusters:
     log_growth = math.log(DENSE_FAR_M / DENSE_FIRST_M) / (slices - 1)
     tan_y, aspect = math.tan(math.pi / 6), VIEWPORT.width_px / VIEWPORT.height_px
     first_m = DENSE_FIRST_M / math.exp(log_growth)
-    values = (DENSE_TILE_PX, slices, first_m, log_growth, 2 * tan_y / VIEWPORT.height_px, -tan_y * aspect, tan_y)
-    grid = ClusterGrid(*(jnp.asarray(value, jnp.int32 if i < 2 else jnp.float32) for i, value in enumerate(values)))
+    grid = ClusterGrid(
+        tile_px_x=jnp.int32(DENSE_TILE_PX),
+        tile_px_y=jnp.int32(DENSE_TILE_PX),
+        depth_slices=jnp.int32(slices),
+        scheme=jnp.int32(0),
+        z_near_m=jnp.float32(first_m),
+        z_far_m=jnp.float32(DENSE_FAR_M),
+        log_growth=jnp.float32(log_growth),
+        slope_per_px=jnp.float32(2 * tan_y / VIEWPORT.height_px),
+        slope_x=jnp.float32(-tan_y * aspect),
+        slope_y=jnp.float32(tan_y),
+        converges=jnp.float32(1),
+        normal_bins=jnp.int32(0),
+    )
     n = columns * rows * slices
     key = jnp.arange(n, dtype=jnp.int32)
     zeros, count = jnp.zeros(n, jnp.int32), jnp.int32(n)
@@ -273,6 +311,7 @@ def main() -> None:
     parser.add_argument("--lights", help="numbers of lights, separated by commas")
     parser.add_argument("--only", default="", help="assigners whose name holds this")
     parser.add_argument("--full", action="store_true", help="also clusters, build and assignment in one program")
+    parser.add_argument("--warp", action="store_true", help="also NVIDIA Warp, instead of the stages of a tree")
     parser.add_argument("--bevy", help="path of the peer's program: its grid and lights instead")
     arguments = parser.parse_args()
     print(f"{device_name()}, jax {jax.__version__}")
@@ -281,7 +320,7 @@ def main() -> None:
     if arguments.bevy:
         dense_benchmark(counts, arguments.only, arguments.bevy)
     else:
-        view_benchmark(counts, arguments.only, arguments.full)
+        view_benchmark(counts, arguments.only, arguments.full, arguments.warp)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -84,7 +84,7 @@ class Sheet:
                 return
 
 
-def frame_ms(technique: str, params: dict[str, object], inputs: FrameInputs) -> float:
+def frame_ms(technique: str, params: Mapping[str, object], inputs: FrameInputs) -> float:
     """Median of the fused frame; NaN where it fails or is over the cap's ten times."""
     config = configuration(technique, params)
     try:
@@ -108,7 +108,7 @@ def median_ms(run: Callable[[], object]) -> float:
     return float(np.median(times)) * 1e3
 
 
-def lists_ms(technique: str, params: dict[str, object], inputs: FrameInputs) -> float:
+def lists_ms(technique: str, params: Mapping[str, object], inputs: FrameInputs) -> float:
     """Of all stages from the lights to the lists, one after the other; NaN where they do not fit."""
     config = configuration(technique, params)
     try:
@@ -124,7 +124,7 @@ def lists_ms(technique: str, params: dict[str, object], inputs: FrameInputs) -> 
     return total
 
 
-def counts_of(technique: str, params: dict[str, object], inputs: FrameInputs) -> dict[str, int]:
+def counts_of(technique: str, params: Mapping[str, object], inputs: FrameInputs) -> dict[str, int]:
     return count(configuration(technique, params), inputs)[0].technique
 
 

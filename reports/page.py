@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import jinja2
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from reports import number_text
 from reports.chart_style import chart_html
 from reports.charts import beyond_the_chart, list_lengths, speed_against_error, stage_times
 from reports.model_charts import predicted_against_measured, time_along_parameters
-from reports.palette import in_stage_order, technique_colour
+from reports.page_environment import page_environment
 from reports.pictures import heat_scale, read_pictures
-from reports.recommendation import comparison, recommend, setting_text
+from reports.recommendation import recommend
 from reports.run_folder import RunFolder, read_run_folder
+from reports.stability_page import stability_of, stability_parts
 from reports.tables import cost_model_groups, count_rows, measurement_table
 from vtfs.files import write_atomically
 
@@ -48,8 +46,9 @@ def render_report(run: RunFolder) -> str:
     """
     pictures = read_pictures(run.path / "pictures", run.quoted("pictures") or [])
     figures = {name: draw(run) for name, draw in _CHARTS.items()}
+    stability = stability_of(run.path)
     return (
-        _environment()
+        page_environment()
         .get_template("report.html")
         .render(
             run=run,
@@ -65,35 +64,7 @@ def render_report(run: RunFolder) -> str:
             cost_models=cost_model_groups(run),
             count_rows=count_rows(run),
             table=measurement_table(run),
+            stability=stability,
+            stability_parts=stability_parts(stability) if stability else (),
         )
     )
-
-
-def _environment() -> jinja2.Environment:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    texts: dict[str, Any] = {
-        "ms": number_text.ms,
-        "seconds": number_text.seconds,
-        "ratio": number_text.ratio,
-        "count": number_text.count,
-        "percent": number_text.percent,
-        "error": number_text.error,
-        "cost": number_text.cost,
-        "setting": number_text.setting,
-    }
-    environment.filters.update(texts)
-    environment.globals.update(
-        comparison=comparison,
-        in_stage_order=in_stage_order,
-        interval=number_text.interval,
-        ratios=number_text.ratios,
-        setting_text=setting_text,
-        technique_colour=technique_colour,
-    )
-    return environment

@@ -44,6 +44,7 @@ _STAGE_COLOURS = {
     "sort": "#5f9488",
     "build_tree": "#3f6f75",
     "assign": "#39587d",
+    "approximate": "#5b7fa6",
     "shade_opaque": "#d9a25f",
     "shade_transparent": "#c47a4a",
     "shadow_planes": "#b4a7c6",
@@ -72,3 +73,10 @@ def in_stage_order(stages: Iterable[str]) -> list[str]:
     """Stages as a frame runs them; unknown ones last, by name."""
     order = list(_STAGE_COLOURS)
     return sorted(set(stages), key=lambda stage: (order.index(stage) if stage in order else len(order), stage))
+
+
+# Of stability: right, a few wrong samples, failing, without an answer; read with their words, not by colour alone.
+HOLDS = "#cfe8d5"
+FEW = ("#fdf0c8", "#f3cf73")
+FAILS = ("#efa083", "#b3362b")
+NOT_RUN = "#dfe3e6"

@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from tuning.budget import Budget
 from tuning.choose import Objective, is_timed, median_interval, time_interval_ms, time_ms
 from tuning.compiles import watch_compiles
 from tuning.measurement import Measurement
 from tuning.run_pictures import draw
+from tuning.search_run import Progress
 from tuning.space import Space, default_space
-from tuning.sweep import Budget, Progress, SearchResult, search
+from tuning.sweep import SearchResult, search
 from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_counts
 from vtfs.device import versions
 from vtfs.files import write_atomically
@@ -25,7 +27,8 @@ from vtfs.frame import FrameInputs
 from vtfs.parameters import Configuration, configuration
 from vtfs.scene_setup import SceneSetup
 
-DEFAULT_BUDGET = Budget(seconds=90.0)
+DEFAULT_BUDGET = Budget(seconds=40.0)
+"""On two CPU cores a frame costs half a second: a dozen configurations, and a minute for the whole command."""
 DEFAULT_CONFIGURATION = configuration("tiled_deferred")
 
 CLAIM = "for this JAX implementation on this device; nothing is rasterised: frame times start at view samples"

@@ -52,8 +52,8 @@ EXACT_ERROR = 1e-4
 """Error above which a configuration that should be exact has failed. float32 gives some 1e-5 near a light, where
 the rounding of its position (1e-7 of its distance to the eye) counts against its distance to the sample."""
 
-LOST = 1.1
-"""A configuration this many times as slow as the best so far has lost: its time needs no more repeats."""
+LOST = 1.03
+"""A configuration this many times as slow as the best so far in all repeats has lost: its time needs no more."""
 
 HOPELESS = 1.6
 """Where one run took this many times as long as the best so far, no other is made: a busy machine explains less."""
@@ -80,7 +80,7 @@ class ScenePath:
 
 
 class SceneWorkload:
-    """Counts and measures configurations on a few frames. Implements `sweep.Workload`."""
+    """Counts and measures configurations on a few frames. Implements `search_run.Workload`."""
 
     def __init__(self, path: ScenePath, compiles: Compiles, objective: Objective = "max"):
         self._path = path

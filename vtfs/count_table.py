@@ -7,9 +7,9 @@ import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from vtfs.frame import FrameCounts, count
+from vtfs.frame import FrameCounts, KeptStages, count
 from vtfs.op_counts import OpCounts
-from vtfs.parameters import Configuration, counted_configuration
+from vtfs.parameters import GRID_PARAMETERS, Configuration, counted_configuration
 from vtfs.scene_setup import SceneSetup
 
 
@@ -31,13 +31,20 @@ def count_frames(
     for frame in frames:
         inputs = setup.inputs(frame)
         counted: dict[Configuration, FrameCounts] = {}
-        for config in configs:
-            canonical = counted_configuration(config)
-            if canonical not in counted:
-                counted[canonical] = count(canonical, inputs)[0]
-            rows.append(CountRow(config, frame, counted[canonical].of(config)))
-            progress(len(rows), len(frames) * len(configs))
+        kept = KeptStages()
+        # Those that share clusters one after the other, and of those the ones that share a tree.
+        for done, config in enumerate(sorted(map(counted_configuration, configs), key=_shared), 1):
+            if config not in counted:
+                counted[config] = count(config, inputs, kept=kept)[0]
+            progress(len(rows) + done, len(frames) * len(configs))
+        rows += [CountRow(config, frame, counted[counted_configuration(config)].of(config)) for config in configs]
     return rows
+
+
+def _shared(config: Configuration) -> tuple[str, str]:
+    """Equal in the first where clusters are, and in both where lists are."""
+    grid = [(name, value) for name, value in config.items if name in GRID_PARAMETERS]
+    return str(grid), str(config.params.get("branching", ""))
 
 
 def counts_csv(rows: Sequence[CountRow]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -131,6 +132,7 @@ class FrameInputs:
         self.frame = frame
         self._earlier_lights = earlier_lights
         self._orders: dict[tuple[int, float], jax.Array] = {}
+        self._scalars: dict[tuple[str, ...], Any] = {}
         self.camera = samples.camera
         self.viewport = samples.camera.viewport
         self.lights = view_lights(lights, samples.camera)
@@ -214,8 +216,7 @@ class FrameInputs:
             env["normals"] = env["gbuffer"].normal if needs_normals else None
         elif technique.lists == "light_volumes":  # for its pixels
             env["grid"] = cluster_grid(self.camera, RUN_WIDTH_PX, 1, self.deepest_m)
-        # A dozen scalars, each of which would be sent to a GPU by itself in every frame: 0.3 ms.
-        env |= jax.device_put({name: env[name] for name in _SCALARS if name in env})
+        env |= {name: self._on_device(name, env[name]) for name in _SCALARS if name in env}
         if technique.casts_shadows:
             env["shadow_slots"] = self.shadows.slots
             if config.technique in SHADOW_REFERENCES:
@@ -223,6 +224,14 @@ class FrameInputs:
             else:
                 env["shadow_tasks"] = self.shadows.tasks(config)
         return env
+
+    def _on_device(self, name: str, scalars: Any) -> Any:
+        """Sent once: a dozen scalars, each by itself, would take a GPU 0.3 ms in every frame. The same for the same
+        values: see `KeptStages`."""
+        key = (name, *map(repr, jax.tree.leaves(scalars)))
+        if key not in self._scalars:
+            self._scalars[key] = jax.device_put(scalars)
+        return self._scalars[key]
 
 
 @jax.jit
@@ -320,8 +329,34 @@ def _fused(stages: tuple[Stage, ...], plan: Plan) -> Callable[..., Any]:
     return jax.jit(run)
 
 
+class KeptStages:
+    """The last results of stages, by what they were made from: the configurations of a space share grids and trees."""
+
+    def __init__(self, most: int = 12):
+        self._most = most
+        self._results: OrderedDict[tuple[Any, ...], tuple[list[Any], Any]] = OrderedDict()
+
+    def run(self, stage: Stage, plan: Plan, arguments: list[Any]) -> Any:
+        # Arguments are kept beside the result: while they live, nothing else has their identity.
+        return self.result((stage, plan), arguments, lambda: stage_program(stage, plan)(*arguments))
+
+    def result(self, what: tuple[Any, ...], arguments: list[Any], make: Callable[[], Any]) -> Any:
+        key = (*what, *map(id, arguments))
+        if key not in self._results:
+            self._results[key] = arguments, make()
+        self._results.move_to_end(key)
+        while len(self._results) > self._most:
+            self._results.popitem(last=False)
+        return self._results[key][1]
+
+
 def run_stages(
-    config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None, *, until: str | None = None
+    config: Configuration,
+    inputs: FrameInputs,
+    sizes: Sizes | None = None,
+    *,
+    until: str | None = None,
+    kept: KeptStages | None = None,
 ) -> tuple[dict[str, Any], Sizes]:
     """Run a frame stage by stage, with larger capacities until everything fits.
 
@@ -329,6 +364,7 @@ def run_stages(
 
     - `sizes`: capacities to start from.
     - `until`: the last stage to run; all by default.
+    - `kept`: where results are looked up first.
 
     **Returns:** the result of every stage (and the inputs) by name, and the capacities that fit.
 
@@ -344,10 +380,11 @@ def run_stages(
     sizes = fitting.covering(sizes) if sizes else fitting
     if "shadow_tasks" in env and not sizes.shadow:
         sizes = replace(sizes, shadow=cast_counted(config, inputs)[1])
+    kept = kept or KeptStages()
     for stage in technique.stages_of(technique.plan(config), inputs.has_transparent):
         while True:
             plan = stage.narrowed(planned(config, sizes))
-            result = stage_program(stage, plan)(*(env[name] for name in stage.needs))
+            result = kept.run(stage, plan, [env[name] for name in stage.needs])
             if stage.name == "clusters" and bool(result.overflowed):
                 sizes = replace(sizes, blocks=rounded_up("blocks", int(result.n_blocks)))
             elif stage.name == "assign" and bool(result[0].overflowed):
@@ -370,6 +407,15 @@ def lengths_of(config: Configuration, env: dict[str, Any], inputs: FrameInputs) 
     if lists == "light_volumes":
         return light_volume_lengths(env["positions"], env["assign"], inputs.n_lights)
     return uniform_lengths(env["positions"], inputs.n_lights)
+
+
+def _kept_lengths(config: Configuration, env: dict[str, Any], inputs: FrameInputs, kept: KeptStages) -> ListLengths:
+    """Equal lists of the same clusters have the same lengths, whichever tree they are from."""
+    if REGISTRY[config.technique].lists != "clusters":
+        return lengths_of(config, env, inputs)
+    counts = np.asarray(env["assign"].count)
+    arguments = [env["positions"], env["clusters"]]
+    return kept.result(("lengths", counts.tobytes()), arguments, lambda: lengths_of(config, env, inputs))
 
 
 @dataclass(frozen=True)
@@ -426,17 +472,24 @@ class FrameCounts:
         return cls(technique, arrays["of_block"], n_solid_blocks, walked, walk_rows, light_runs, branching, sizes)
 
 
-def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None) -> tuple[FrameCounts, ListLengths]:
-    """Count what a configuration does on a frame; nothing is shaded."""
+def count(
+    config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None, kept: KeptStages | None = None
+) -> tuple[FrameCounts, ListLengths]:
+    """Count what a configuration does on a frame; nothing is shaded.
+
+    **Arguments:**
+
+    - `kept`: of configurations counted before on the same frame.
+    """
     if REGISTRY[config.technique].casts_shadows:
         return _count_shadowed(config, inputs, sizes)
-    technique = REGISTRY[config.technique]
+    technique, kept = REGISTRY[config.technique], kept or KeptStages()
     if is_listed(config):
         last = "approximate" if approximates(config) else "assign"
-        env, sizes = run_stages(config, inputs, sizes, until=last)
+        env, sizes = run_stages(config, inputs, sizes, until=last, kept=kept)
     else:
         env, sizes = inputs.environment(config), NO_SIZES
-    lengths = lengths_of(config, env, inputs)
+    lengths = _kept_lengths(config, env, inputs, kept)
     branching = int(config.params.get("branching", _BRUTE_FORCE_WORD))
     tile_px, _ = tile_and_slices({"tile_px": PARAMETERS["tile_px"].default} | config.params, inputs.viewport)
     fragments = inputs.fragments(technique.shades_hidden(config))
@@ -444,7 +497,9 @@ def count(config: Configuration, inputs: FrameInputs, sizes: Sizes | None = None
     counts |= {"hidden_fragments": fragments.n_samples - inputs.fragments(with_hidden=False).n_samples}
     walked, rows, light_runs = technique.walked(technique.plan(config), inputs.n_lights), (), 0
     if technique.lists == "clusters":
-        listed = list_lengths(env["positions"], env["clusters"], env["listed"])
+        listed = lengths
+        if env["listed"] is not env["assign"]:
+            listed = list_lengths(env["positions"], env["clusters"], env["listed"])
         counts |= cluster_counts(listed, n_cells(env["grid"], inputs.viewport), inputs.n_lights)
         counts |= approximation_counts(listed, lengths)
         counts |= assign_counts(_published_counts(config, env, inputs), inputs.n_lights, branching)

@@ -53,7 +53,7 @@ class Materials:
         alpha = None
         if image is not None:
             colour = colour * mean_linear_colour(image)
-            if mode == "MASK" and has_uv:
+            if mode != "OPAQUE" and has_uv:
                 alpha = alpha_of(image)
             elif mode == "BLEND":
                 opacity *= float(alpha_of(image).mean())

@@ -208,6 +208,7 @@ PARAMETERS: dict[str, Parameter] = {
 _TILES = ("tile_px", "tile_px_x", "tile_px_y", "grid")
 _SLICES = ("depth_slices", "depth_scheme")
 _CLUSTERS = ("bounds", "cull", "unique", "normal_bins", "normal_cones")
+GRID_PARAMETERS = (*_TILES, *_SLICES, *_CLUSTERS)
 _SHADING = ("gbuffer", "light_cutoff")
 _BRUTE_FORCE = ("assigner", "batch", *_CLUSTERS, *_SHADING, "approximate")
 _TREE = ("branching", "resort_every", "assigner")

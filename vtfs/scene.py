@@ -29,8 +29,8 @@ class Material:
     - `base_colour`, `emissive`: linear. A base colour texture stands here as its mean.
     - `specular`, `shininess`: reflectance at normal incidence and Blinn-Phong exponent.
     - `alpha_mode`: `mask` surfaces are there where `opacity * alpha_image >= alpha_cutoff`; `blend` surfaces belong to
-      a transparent layer.
-    - `alpha_image`: float32 `[h, w]` in [0, 1], row 0 at v = 0; only where the mode is `mask`.
+      a transparent layer, and hide `opacity * alpha_image` of what is behind them.
+    - `alpha_image`: float32 `[h, w]` in [0, 1], row 0 at v = 0; none where the mode is `opaque`.
     """
 
     name: str

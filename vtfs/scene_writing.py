@@ -48,9 +48,12 @@ def save_obj(scene: Scene, path: Path) -> None:
             f"Ke {_text(material.emissive)}",
             f"Ks {_text((material.specular,) * 3)}",
             f"Ns {material.shininess!r}",
-            f"d {material.opacity!r}",
         ]
-        if material.alpha_image is not None:
+        # An alpha image means an alpha test there: what blends keeps the mean of its own.
+        is_tested = material.alpha_mode == "mask" and material.alpha_image is not None
+        mean = 1.0 if material.alpha_image is None or is_tested else float(material.alpha_image.mean())
+        lines.append(f"d {material.opacity * mean!r}")
+        if material.alpha_image is not None and is_tested:
             name = f"{path.stem}.alpha{i}.png"
             image = io.BytesIO()
             Image.fromarray(_bytes(material.alpha_image)).save(image, format="PNG")

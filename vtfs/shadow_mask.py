@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vtfs.cluster_grid import ClusterGrid
 from vtfs.gbuffer import Fragments, Positions, to_runs
+from vtfs.layers import Layers
 from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight
-from vtfs.shadow_volumes.planes import Extra
+from vtfs.shadow_volumes.planes import Extra, Precision
 
 if TYPE_CHECKING:
     from vtfs.view_samples import ViewSamples
@@ -63,6 +64,7 @@ class ShadowPlan:
     - `stencil`: of z-pass and z-fail: 8 bits that wrap or saturate, or no limit; `around_eye`: z-pass starts with the
       volumes
       around the eye, without which it fails where the camera stands in one.
+    - `precision`: in which samples are tested against planes. float32 leaks at vertices: it is there to show that.
     - `clusters`, `groups`, `leaf_groups`, `pairs`, `cells`: rounded capacities: of clusters and their blocks, of the
       lists of a level, of the lists of tiles or clusters, of what goes on to a second pass, of the full tree.
     - `level_groups`: capacities of each level's lists. Then levels are unrolled and nothing loops, which suits a GPU;
@@ -80,6 +82,7 @@ class ShadowPlan:
     tree: Tree = "compact"
     stencil: Stencil = "unlimited"
     around_eye: bool = True
+    precision: Precision = "float64"
     clusters: int = 0
     groups: int = 0
     leaf_groups: int = 0
@@ -210,10 +213,12 @@ def shadow_frame(
     """
     camera = samples.camera
     mask = samples.valid if receives is None else receives & samples.valid
+    # Transparent layers are views of their own.
+    alone = replace(samples, layers=Layers())
     with jax.enable_x64(True):
         put: Any = jax.device_put
         return ShadowFrame(
-            positions=Fragments(samples, with_hidden=False).positions() if positions is None else positions,
+            positions=Fragments(alone, with_hidden=False).positions() if positions is None else positions,
             receives=put(to_runs(mask)),
             grid=grid,
             vertex_m=casters.vertex_m,

@@ -39,7 +39,7 @@ def kept_casters(casters: Casters, light: ShadowLight, front_faces: FrontFaces) 
     return Casters(casters.vertices_m, casters.triangles[~facing_light(casters, light)])
 
 
-def _moved(points_m: np.ndarray, light: np.ndarray, bias_m: float) -> tuple[np.ndarray, np.ndarray]:
+def moved_points(points_m: np.ndarray, light: np.ndarray, bias_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Points moved toward the light by the bias, at most onto it; and the way from there to the light."""
     if light[3] == 0:
         moved = points_m + bias_m * light[:3]
@@ -70,8 +70,8 @@ def brute_force(
     if not casters.n_triangles or not len(points_m):
         return shadowed
     homogeneous = light.homogeneous - np.append(origin, 0) * light.homogeneous[3]
-    moved, _ = _moved(points_m, homogeneous, bias_m)
-    planes, behind = _volume_planes(casters, origin, homogeneous)
+    moved, _ = moved_points(points_m, homogeneous, bias_m)
+    planes, behind = volume_planes(casters, origin, homogeneous)
     moved = moved if light.directional else moved - homogeneous[:3]
     n_points = max(1, min(len(points_m), _PAIRS_AT_ONCE // casters.n_triangles))
 
@@ -90,7 +90,7 @@ def brute_force(
     return shadowed
 
 
-def _volume_planes(
+def volume_planes(
     casters: Casters, origin_m: np.ndarray, light: np.ndarray
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
     """Inward normals `[T, 3]` of the three side planes and the triangle's, and the products that points inside exceed.
@@ -109,6 +109,8 @@ def _volume_planes(
     away = -(face @ light[:3]) if light[3] == 0 else (face * a).sum(axis=1)
     # What is seen edge-on up to rounding has no inside: its orientation would be noise.
     size = sum(np.linalg.norm(n, axis=1) * np.linalg.norm(v, axis=1) for n, v in zip(sides, (a, b, c), strict=True))
+    # With a vertex at the light all of that vanishes, and the volume is rounding.
+    size = np.maximum(size, np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1) * np.linalg.norm(a, axis=1))
     sign = np.where(np.abs(away) > 1e-12 * size, np.sign(away), 0.0)[:, None]
     height = np.where(sign[:, 0] != 0, (face * a).sum(axis=1) * sign[:, 0], np.inf)
     planes = tuple(n * sign for n in (*sides, face))
@@ -139,7 +141,7 @@ class ShadowRays:
             return np.zeros(len(points_m), bool)
         origin = np.zeros(3) if origin_m is None else np.asarray(origin_m, np.float64)
         homogeneous = light.homogeneous
-        start, way = _moved(points_m, homogeneous - np.append(origin, 0) * homogeneous[3], bias_m)
+        start, way = moved_points(points_m, homogeneous - np.append(origin, 0) * homogeneous[3], bias_m)
         if light.directional:
             way = way * (4 * self._extent_m + 4 * np.abs(start + origin - self._middle_m).max())
         start = np.ascontiguousarray(start + (origin - self._middle_m), np.float32)
@@ -197,6 +199,75 @@ def classify(
         else:
             errors.append(index)
     return Mismatches(near_edge, near_plane, len(errors), np.array(errors, np.int64))
+
+
+def is_excused(
+    points_m: np.ndarray,
+    shadowed: np.ndarray,
+    casters: Casters,
+    light: ShadowLight,
+    bias_m: float,
+    own_triangle: np.ndarray,
+    origin_m: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """May an answer differ from the reference because its sample lies in a band, bool `[n]` each?
+
+    The stricter form of `classify`, for samples that lie on casters. There every edge and every plane excuse what is
+    near to them. Here an answer is right if a sample moved within the band has it: interior edges do not excuse light
+    (a crack between two triangles is an error), nor a surface's own plane that it shadows itself. An edge within
+    1e-5 rad excuses shadow: of a triangle seen edge-on it may be too thin to be met by moving.
+
+    **Arguments:** as of `brute_force`; `shadowed`: the answers, `[n]`, each of them the reference's opposite.
+
+    **Returns:** excused by an edge; excused by a plane.
+    """
+    origin = np.zeros(3) if origin_m is None else np.asarray(origin_m, np.float64)
+    homogeneous = light.homogeneous - np.append(origin, 0) * light.homogeneous[3]
+    way = homogeneous[:3] - homogeneous[3] * points_m
+    distance = np.linalg.norm(way, axis=1, keepdims=True)
+    way = way / np.maximum(distance, 1e-300)
+    reach = EDGE_BAND_RAD * (np.full_like(distance, casters.extent_m) if light.directional else distance)
+    # Any axis that is not along the way.
+    across = np.cross(way, np.eye(3)[np.abs(way).argmin(axis=1)])
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+    down = np.cross(way, across)
+
+    def is_right(moved_m: np.ndarray, moved_bias_m: float) -> np.ndarray:
+        # Moved, a sample may lie below its own triangle.
+        return brute_force(moved_m, casters, light, moved_bias_m, origin, own_triangle) == shadowed
+
+    by_edge = np.zeros(len(points_m), bool)
+    for share in (0.25, 1.0):
+        for angle in 2 * np.pi * np.arange(8) / 8:
+            step = share * reach * (np.cos(angle) * across + np.sin(angle) * down)
+            by_edge |= is_right(points_m + step, bias_m)
+    left = np.flatnonzero(shadowed & ~by_edge)
+    if not light.directional:
+        by_edge[left] = _is_near_an_edge(-way[left], casters, origin + homogeneous[:3])
+    by_plane = np.zeros(len(points_m), bool)
+    for biases in (1 - PLANE_BAND_BIASES, 0.0, 1 + PLANE_BAND_BIASES):
+        by_plane |= is_right(points_m, biases * bias_m)
+    return by_edge, by_plane
+
+
+def _is_near_an_edge(way: np.ndarray, casters: Casters, light_m: np.ndarray) -> np.ndarray:
+    """Do unit directions from a light pass within 1e-5 rad of an edge, bool `[n]`? As `_edge_angle`, all at once."""
+    near = np.zeros(len(way), bool)
+    corner = [casters.vertices_m[casters.triangles[:, k]] - light_m for k in range(3)]
+    corner = [v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-300) for v in corner]
+    n_ways = max(1, _PAIRS_AT_ONCE // max(1, casters.n_triangles))
+    for first in range(0, len(way), n_ways):
+        some, found = way[first : first + n_ways], np.zeros(min(n_ways, len(way) - first), bool)
+        for k in range(3):
+            a, b = corner[k], corner[(k + 1) % 3]
+            found |= ((some @ a.T) >= np.cos(EDGE_BAND_RAD)).any(axis=1)
+            normal = np.cross(a, b)
+            size = np.linalg.norm(normal, axis=1)
+            normal = normal / np.maximum(size, 1e-300)[:, None]
+            abreast = (some @ np.cross(normal, a).T >= 0) & (some @ np.cross(b, normal).T >= 0) & (size > 1e-14)
+            found |= (abreast & (np.abs(some @ normal.T) <= EDGE_BAND_RAD)).any(axis=1)
+        near[first : first + n_ways] = found
+    return near
 
 
 def _edge_angle(point: np.ndarray, corners: list[np.ndarray], light: np.ndarray, extent_m: float) -> float:

@@ -50,10 +50,10 @@ _TESTS_AT_ONCE = {"cpu": 2**19, "gpu": 2**22}
 """`batch = 0` means all queries at once, as far as their rows of boxes stay in the cache of a CPU (12 MB) or leave
 the memory of a GPU to others (100 MB)."""
 
-_WORDS_AT_ONCE = {"cpu": 2**14, "gpu": 2**22}
+_WORDS_AT_ONCE = {"cpu": 2**14, "gpu": 2**23}
 """The same, in words of 32 tests, where lists are refined: one light is loaded for all cells of a group."""
 
-_FEW_LIGHTS = {"cpu": 256, "gpu": 256}
+_FEW_LIGHTS = {"cpu": 512, "gpu": 256}
 """Up to so many lights `auto` tests all pairs; see `benchmarks/light_assignment.py`."""
 
 Assigner = Literal["published", "coarse_to_fine", "auto"]
@@ -243,7 +243,7 @@ def _assign_otherwise(plan: Plan, lights: ViewLights, light_cutoff, clusters: Cl
 def assign_chunk(walked: Walked, batch: int, branching: int, pairs: int) -> int:
     """Rows tested at once: (cluster, node) pairs, or words of 32 (cluster, light) pairs."""
     if walked == "groups":
-        return batch or _WORDS_AT_ONCE.get(jax.default_backend(), 2**22)
+        return batch or _WORDS_AT_ONCE.get(jax.default_backend(), 2**23)
     return walk_chunk(batch, branching if walked == "tree" else WORD_BITS, pairs)
 
 

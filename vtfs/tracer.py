@@ -49,14 +49,15 @@ class Tracer:
         seen = np.full((camera.viewport.height_px, camera.viewport.width_px), -1, np.int32)
 
         def trace(rows: slice) -> None:
-            rays = _Rays(camera, rows)
+            rays = _Rays(camera, rows, self._centre_m)
             band = seen[rows].reshape(-1)
-            first, _ = self._first_hits(self._solid, *rays.at(camera.near_m))
+            first, _ = self._solid.first_hits(*rays.at(camera.near_m))
             masked = np.flatnonzero((first >= 0) & self._is_masked[first])
             band[...] = first
             band[masked] = -1
             # Rays that met an alpha-tested surface go on until one passes its test.
-            for ray, triangle, _ in self._march(self._solid, found, rays, masked, np.inf, only_first=True):
+            hits = self._march(self._solid, found, rays, masked, np.inf, only_first=True, hit=first[masked])
+            for ray, triangle, _ in hits:
                 band[ray] = triangle
 
         by_bands(camera, trace)
@@ -77,7 +78,7 @@ class Tracer:
         found: dict[int, list[tuple[np.ndarray, ...]]] = {}
 
         def trace(rows: slice) -> None:
-            rays = _Rays(camera, rows)
+            rays = _Rays(camera, rows, self._centre_m)
             first_pixel = rows.start * camera.viewport.width_px
             scene = self._blended if blended else self._solid
             ends_m = until_m[rows].reshape(-1)
@@ -98,12 +99,9 @@ class Tracer:
 
         **Returns:** int32 triangle indices, -1 for none, and float32 parameters along the rays.
         """
-        return self._first_hits(self._solid, origin_m, direction)
-
-    def _first_hits(
-        self, scene: _EmbreeScene, origin_m: np.ndarray, direction: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return scene.first_hits(origin_m - self._centre_m, direction)
+        return self._solid.first_hits(
+            np.ascontiguousarray(origin_m - self._centre_m, np.float32), np.ascontiguousarray(direction, np.float32)
+        )
 
     def _march(
         self,
@@ -113,6 +111,7 @@ class Tracer:
         ray: np.ndarray,
         until_m: np.ndarray | float,
         only_first: bool,
+        hit: np.ndarray | None = None,
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Steps of rays from surface to surface: ray, triangle and depth of those that pass their alpha test.
 
@@ -121,6 +120,7 @@ class Tracer:
         - `ray`: which of `rays` to follow.
         - `until_m`: depth at which they end, of all or `[len(rays)]`.
         - `only_first`: a ray ends at the first surface that passes.
+        - `hit`: the triangles that the rays meet first, if the caller has them already.
         """
         ends_m = np.broadcast_to(until_m, len(rays.x))
         # The first step past a surface: some float32 roundings of the coordinates that Embree sees.
@@ -128,7 +128,8 @@ class Tracer:
         past_m, step_m = np.full(len(ray), rays.near_m), np.full(len(ray), resolution_m)
         last = np.full(len(ray), -1, np.int32)
         for _ in range(_LARGEST_LAYERS):
-            hit, _ = self._first_hits(scene, *rays.at(past_m, ray))
+            if hit is None:
+                hit, _ = scene.first_hits(*rays.at(past_m, ray))
             on = np.flatnonzero(hit >= 0)
             ray, past_m, step_m, last, hit = (values[on] for values in (ray, past_m, step_m, last, hit))
             if len(ray) == 0:
@@ -143,6 +144,7 @@ class Tracer:
             past_m = np.maximum(np.where(is_again, past_m, depth_m), past_m) + step_m
             on = np.flatnonzero(~is_over & ~is_there if only_first else ~is_over)
             ray, past_m, step_m, last = (values[on] for values in (ray, past_m, step_m, hit))
+            hit = None
         log.warning("%d rays met more than %d surfaces; the others are not seen", len(ray), _LARGEST_LAYERS)
 
 
@@ -161,11 +163,10 @@ class _EmbreeScene:
             self._embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # the first query builds it
 
     def first_hits(self, origin_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Triangle and parameter of the first hit of each ray; float32 `[N, 3]`, C-contiguous."""
         if self.is_empty or len(origin_m) == 0:
             return np.full(len(origin_m), -1, np.int32), np.full(len(origin_m), np.inf, np.float32)
-        hits = self._embree.run(
-            np.ascontiguousarray(origin_m, np.float32), np.ascontiguousarray(direction, np.float32), output=True
-        )
+        hits = self._embree.run(origin_m, direction, output=True)
         primitive = hits["primID"]
         return np.where(primitive >= 0, self._triangle_of[primitive], -1), hits["tfar"]
 
@@ -176,21 +177,26 @@ class _Rays:
     In a parallel projection slopes are where rays start, and all have one direction.
     """
 
-    def __init__(self, camera: Camera, rows: slice):
+    def __init__(self, camera: Camera, rows: slice, centre_m: np.ndarray):
         self.near_m = camera.near_m
         self.x, self.y = pixel_rays(camera, rows)
         self._right, self._up, self._backward = camera.view_from_world[:3, :3]
         self._eye_m = np.asarray(camera.eye_m, np.float64)
+        self._centre_m = centre_m
         self._is_parallel = camera.is_orthographic
 
     def at(self, depth_m: np.ndarray | float, ray: np.ndarray | slice = np.s_[:]) -> tuple[np.ndarray, np.ndarray]:
-        """World-space points at a depth on some rays, and the rays' directions: float64 `[N, 3]`."""
-        aside, depth_m = self.x[ray, None] * self._right + self.y[ray, None] * self._up, np.reshape(depth_m, (-1, 1))
-        if self._is_parallel:
-            direction = np.broadcast_to(-self._backward, aside.shape)
-            return self._eye_m + aside + depth_m * direction, direction
-        direction = aside - self._backward
-        return self._eye_m + depth_m * direction, direction
+        """Points at a depth on some rays, relative to the centre, and the rays' directions: float32 `[N, 3]`, world
+        axes. Float64 until then."""
+        x, y = self.x[ray], self.y[ray]
+        origin_m, direction = np.empty((2, len(x), 3), np.float32)
+        for k in range(3):  # a column at a time: NumPy is slow on rows of three
+            aside = x * self._right[k] + y * self._up[k]
+            along = -self._backward[k] if self._is_parallel else aside - self._backward[k]
+            start_m = self._eye_m[k] + aside if self._is_parallel else self._eye_m[k]
+            direction[:, k] = along
+            origin_m[:, k] = start_m + depth_m * along - self._centre_m[k]
+        return origin_m, direction
 
 
 class Planes:
@@ -208,8 +214,8 @@ class Planes:
         offset = (normal * v0).sum(axis=1)
         self.scene, self._camera = scene, camera
         self.row = np.column_stack([normal, offset, depths.min(axis=0), depths.max(axis=0)])
-        masked = np.array([m.alpha_mode == "mask" and m.alpha_image is not None for m in scene.materials])
-        textured = np.flatnonzero(masked[scene.material_index])
+        has_image = np.array([material.alpha_image is not None for material in scene.materials])
+        textured = np.flatnonzero(has_image[scene.material_index])
         self._uv_row = np.zeros((0, 8))
         if scene.uv is not None and len(textured):
             self._row_of = np.zeros(scene.n_triangles, np.int32)
@@ -233,23 +239,31 @@ class Planes:
 
     def is_opaque(self, triangle: np.ndarray, x: np.ndarray, y: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
         """Alpha test where rays meet triangles at given depths, bool `[N]`; without an alpha test it is passed."""
+        materials = self.scene.materials
+        cutoff = np.array([m.alpha_cutoff if m.alpha_mode == "mask" else -np.inf for m in materials])
+        masked = np.flatnonzero(np.isfinite(cutoff)[self.scene.material_index[triangle]])
         opaque = np.ones(len(triangle), bool)
+        at = triangle[masked]
+        alpha = self.alpha(at, x[masked], y[masked], depth_m[masked])
+        opaque[masked] = alpha >= cutoff[self.scene.material_index[at]]
+        return opaque
+
+    def alpha(self, triangle: np.ndarray, x: np.ndarray, y: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+        """`opacity * alpha_image` where rays meet triangles at given depths, float64 `[N]`."""
         index = self.scene.material_index[triangle]
+        alpha = np.array([material.opacity for material in self.scene.materials])[index]
         for m in np.flatnonzero(np.bincount(index, minlength=len(self.scene.materials))):
-            material = self.scene.materials[m]
-            if material.alpha_mode != "mask":
+            image = self.scene.materials[m].alpha_image
+            if image is None or self.scene.uv is None:
                 continue
             here = np.flatnonzero(index == m)
-            if material.alpha_image is None or self.scene.uv is None:
-                opaque[here] = material.opacity >= material.alpha_cutoff
-                continue
             row = self._uv_row[self._row_of[triangle[here]]]
             width = self._camera.width_at(depth_m[here])
             rx, ry, rz = x[here] * width, y[here] * width, -depth_m[here]
             u = row[:, 0] * rx + row[:, 1] * ry + row[:, 2] * rz + row[:, 3]
             v = row[:, 4] * rx + row[:, 5] * ry + row[:, 6] * rz + row[:, 7]
-            opaque[here] = material.opacity * _bilinear(material.alpha_image, u, v) >= material.alpha_cutoff
-        return opaque
+            alpha[here] *= bilinear(image, u, v)
+        return alpha
 
 
 def _uv_rows(corners: tuple[np.ndarray, np.ndarray, np.ndarray], normal: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -269,7 +283,7 @@ def _uv_rows(corners: tuple[np.ndarray, np.ndarray, np.ndarray], normal: np.ndar
     return rows
 
 
-def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """An image at texture coordinates, repeated; texel centres lie at `(i + 1/2) / n`."""
     height, width = image.shape
     with np.errstate(invalid="ignore"):  # a triangle without area has any coordinates
@@ -277,8 +291,10 @@ def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         row = np.nan_to_num(v - np.floor(v), posinf=0, neginf=0) * height - 0.5
     left, above = np.floor(column).astype(np.int32), np.floor(row).astype(np.int32)
     s, t = column - left, row - above
-    left, above = left % width, above % height
-    right, below = (left + 1) % width, (above + 1) % height
+    # Within one of the image: remainders of integers are slow.
+    right, below = left + 1, above + 1
+    left[left < 0], above[above < 0] = width - 1, height - 1
+    right[right >= width], below[below >= height] = 0, 0
     texels = image.ravel()
     upper = texels[above * width + left] * (1 - s) + texels[above * width + right] * s
     lower = texels[below * width + left] * (1 - s) + texels[below * width + right] * s

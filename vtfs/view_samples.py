@@ -103,18 +103,20 @@ def _layers(scene: Scene, samples: ViewSamples, tracer: Tracer | None) -> Layers
     any_tracer = functools.cache(lambda: tracer or Tracer(scene))
     # Planes are 14 numbers a triangle: made again where layers are asked for, and not kept for each frame.
     made_planes = functools.partial(Planes, scene, camera)
-    opacity = np.array([material.opacity for material in scene.materials], np.float32)
 
     def transparent() -> tuple[TransparentLayer, ...]:
         if not any(material.alpha_mode == "blend" for material in scene.materials):
             return ()
         until_m = np.where(samples.valid, -samples.position_m[..., 2].astype(np.float64), camera.far_m)
-        planes = made_planes()
+        planes, (x, y) = made_planes(), camera.pixel_slopes()
         layers = []
         for triangle in transparent_triangles(any_tracer, planes, camera, until_m, key):
             layer = _samples_from(planes, camera, triangle)
-            shares = np.where(layer.valid, opacity[scene.material_index[triangle]].clip(0, 1), 0)
-            layers.append(TransparentLayer(layer, shares.astype(np.float32)))
+            row, column = np.nonzero(layer.valid)
+            depth_m = -layer.position_m[row, column, 2].astype(np.float64)
+            opacity = np.zeros(triangle.shape, np.float32)
+            opacity[row, column] = planes.alpha(triangle[row, column], x[column], y[row], depth_m).clip(0, 1)
+            layers.append(TransparentLayer(layer, opacity))
         return tuple(layers)
 
     def hidden() -> tuple[ViewSamples, ...]:

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import tuning.sweep
+from tuning.budget import Budget
 from tuning.choose import choose_next, initial_design
 from tuning.measurement import Measurement, Outcome
 from tuning.record import read_measurements
+from tuning.search_run import Progress, Workload
 from tuning.space import Space, default_space
-from tuning.sweep import PATIENCE, Budget, Progress, Workload, search
+from tuning.sweep import PATIENCE, search
 from vtfs.input_error import InputError
 from vtfs.parameters import Configuration, configuration
 
@@ -437,9 +439,9 @@ def test_a_count_is_never_exceeded_and_some_of_it_goes_to_accuracy(tmp_path, n):
     assert len(workload.measured) == n
     approximate = [c for c in workload.measured if not c.is_exact]
     assert len(approximate) >= n // 5
-    assert len(result.pareto) >= 1 + (n >= 20)
-    if n == 20:
-        assert result.stop_reason == "the budget of 20 measurements was used"
+    assert len(result.pareto) >= 1 + (n >= 12)
+    if n == 12:
+        assert result.stop_reason == "the budget of 12 measurements was used"
 
 
 def test_seconds_are_those_spent_measuring_and_the_last_measurement_is_completed(tmp_path):
@@ -448,7 +450,7 @@ def test_seconds_are_those_spent_measuring_and_the_last_measurement_is_completed
     class Slow(Synthetic):
         def measure(self, configuration, best_ms, /):
             nonlocal now
-            now += 10
+            now += 10.5  # with half a second of compiling
             return super().measure(configuration, best_ms)
 
     workload = Slow(LAUNCH_BOUND)
@@ -456,10 +458,10 @@ def test_seconds_are_those_spent_measuring_and_the_last_measurement_is_completed
     assert len(workload.measured) == 10  # the tenth starts at 90 s
 
 
-def test_seconds_of_an_earlier_run_are_those_of_its_repeats_and_compiling(tmp_path):
+def test_seconds_of_an_earlier_run_are_those_of_its_repeats(tmp_path):
     path = tmp_path / "measurements.jsonl"
     search(SMALL, Synthetic(LAUNCH_BOUND), path, Budget(measurements=4))
-    spent_s = sum(m.compile_s + sum(map(sum, m.stages_ms["frame"])) / 1e3 for m in read_measurements(path))
+    spent_s = sum(sum(map(sum, m.stages_ms["frame"])) / 1e3 for m in read_measurements(path))
     again = Synthetic(LAUNCH_BOUND)
     search(SMALL, again, path, Budget(seconds=spent_s * 0.99), clock=lambda: 0.0)
     assert again.measured == []

@@ -7,7 +7,7 @@ from tests.strategies import a_camera, adversarial_lights, surface_samples
 from tests.vtfs.test_light_assignment import listed_lights
 from tests.vtfs.test_light_culling import as_spots
 from vtfs import techniques
-from vtfs.frame import FrameCounts, FrameInputs, count
+from vtfs.frame import FrameCounts, FrameInputs, count, stage_program
 from vtfs.parameters import ConflictError, configuration
 from vtfs.techniques import REGISTRY
 
@@ -70,17 +70,11 @@ def test_both_ways_of_auto_make_the_same_lists(monkeypatch):
     for few, walked in ((100, "all_pairs"), (0, "groups")):
         monkeypatch.setitem(techniques._FEW_LIGHTS, "cpu", few)
         # Programs are kept by their configuration: this one is made with another constant.
-        techniques_programs_forgotten()
+        stage_program.cache_clear()
         assert count(config, inputs)[0].walked == walked
         found.append(listed_lights(config, inputs)[0])
-    techniques_programs_forgotten()
-    assert np.array_equal(*found)
-
-
-def techniques_programs_forgotten():
-    from vtfs.frame import stage_program
-
     stage_program.cache_clear()
+    assert np.array_equal(*found)
 
 
 @pytest.mark.parametrize("loose", [{"cull": "planes"}, {"cull": "screen_rect"}, {"leaf_test": "box"}], ids=str)

@@ -20,7 +20,7 @@ from vtfs.parameters import PARAMETERS, TECHNIQUES, TUNED_TECHNIQUES, configurat
 from vtfs.scene import save_scene
 from vtfs.scene_setup import SceneOptions, set_up
 
-COMMANDS = ("tune", "count", "render", "report", "scenes", "techniques", "doctor")
+COMMANDS = ("tune", "count", "render", "stability", "report", "scenes", "techniques", "doctor")
 CAMERA = {
     "width": 64,
     "height": 36,

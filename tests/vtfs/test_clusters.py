@@ -68,6 +68,22 @@ def test_clusters_are_the_cells_that_hold_samples(viewport, bounds, tile_px, n_s
             assert high[2] <= inside[:, 2].max() + slack and low[2] >= inside[:, 2].min() - slack
 
 
+def test_what_a_gpu_runs_makes_the_same_clusters(monkeypatch):
+    samples, _ = samples_in_slices(SMALL, 7, 3, 0.8)
+    grid, positions = cluster_grid(samples.camera, 2, 7, 0.0), positions_of(samples)
+    expected = form(positions, grid, "implicit", CELLS, CAPACITY)
+    with monkeypatch.context() as patched:
+        patched.setattr(jax, "default_backend", lambda: "gpu")
+        program = jax.jit(lambda p, g: form_clusters(p, g, "implicit", CELLS, CAPACITY)).lower(positions, grid)
+    found = program.compile()(positions, grid)
+    n_clusters, n_blocks = int(expected.n_clusters), int(expected.n_blocks)
+    assert int(found.n_clusters) == n_clusters > 10 and int(found.n_blocks) == n_blocks
+    assert np.array_equal(found.key[:n_clusters], expected.key[:n_clusters])
+    assert np.array_equal(found.block_cluster[:n_blocks], expected.block_cluster[:n_blocks])
+    valid = np.asarray(positions.valid)
+    assert np.array_equal(found.block_of_sample[valid], expected.block_of_sample[valid])
+
+
 def clusters_run(clusters):
     return np.asarray(clusters.block_run)
 

@@ -7,6 +7,7 @@ import pytest
 
 from tests.command_line import vtfs
 from tests.slow_counts import slow_counts
+from vtfs import frame
 from vtfs.camera import Viewport
 from vtfs.count_table import count_frames, counts_csv, print_counts
 from vtfs.frame import FrameInputs, count
@@ -108,3 +109,22 @@ def test_the_command_counts_what_the_definitions_say(technique, tile_px, depth_s
         )  # fmt: skip
         assert expected["samples"] > 1000 and expected["lighting_computations"] > 1000
         assert {name: record[name] for name in NAMES} == pytest.approx(expected, rel=1e-3)
+
+
+def test_configurations_that_share_a_grid_share_its_clusters_and_lights_their_tree(setup, monkeypatch):
+    ran = []
+    program = frame.stage_program
+    monkeypatch.setattr(frame, "stage_program", lambda stage, plan: ran.append(stage.name) or program(stage, plan))
+    by_tree = [
+        configuration(technique, {"tile_px": tile_px, "branching": branching, "batch": 1024})
+        for technique in ("volume_tiled_bvh", "clustered_forward")
+        for branching in (8, 32)
+        for tile_px in (8, 16)
+    ]
+    shared = count_frames(setup, by_tree, (5,), lambda *_: None)
+    assert {name: ran.count(name) for name in ran} == {
+        "clusters": 2, "reduce": 1, "morton": 1, "sort": 1, "build_tree": 2, "assign": 4
+    }  # fmt: skip
+    for row in shared[2:4]:
+        expected, _ = count(row.configuration.replaced(batch=0), setup.inputs(5))
+        assert row.counts == expected.at_batch(1024)

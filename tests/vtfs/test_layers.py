@@ -37,6 +37,20 @@ def test_blended_surfaces_are_seen_against_the_sky_and_clipped_at_near_and_far()
     assert_allclose(depths(layer.samples for layer in samples.layers.transparent), [2])
 
 
+def test_the_opacity_of_a_layer_is_read_from_its_image():
+    image = np.array([[0.2, 0.6]], np.float32)
+    pane = Material("pane", opacity=0.5, alpha_mode="blend", alpha_image=image)
+    corners = np.array([(-4.0, -4, -2), (4, -4, -2), (4, 4, -2), (-4, 4, -2)])
+    uv = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+    scene = Scene("pane", corners, np.array([[0, 1, 2], [0, 2, 3]]), uv, np.zeros(2, np.int32), (pane,))
+    camera = Camera((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 90.0, 0.1, 20.0, Viewport(8, 4))
+    (layer,) = trace_view_samples(scene, camera).layers.transparent
+    u = 0.5 + camera.pixel_slopes()[0] * 2 / 8
+    # Texel centres lie at u = 1/4 and 3/4; between them the image is linear, beyond them it repeats.
+    expected = 0.5 * np.interp(u, [-0.25, 0.25, 0.75, 1.25], [0.6, 0.2, 0.6, 0.2])
+    assert_allclose(layer.opacity, np.broadcast_to(expected, (4, 8)), rtol=1e-6)  # stored in float32
+
+
 def test_a_scene_without_blended_surfaces_has_no_layers():
     assert trace_view_samples(stacked(square(5, SOLID)), FRONT).layers.transparent == ()
 

@@ -111,14 +111,14 @@ def test_materials_are_read_in_full(tmp_path):
     assert_allclose(scene.uv, [(0, 0), (1, 0), (0, 1)])
 
 
-def test_blend_and_opaque_materials_keep_no_image(tmp_path):
+def test_blend_materials_keep_the_image_of_their_alpha_and_opaque_ones_none(tmp_path):
     picture = "data:image/png;base64," + base64.b64encode(png(np.full((2, 2, 4), 128))).decode()
     pbr = {"baseColorFactor": [1, 1, 1, 0.5], "baseColorTexture": {"index": 0}}
-    for mode, opacity in (("BLEND", 0.5 * 128 / 255), ("OPAQUE", 1.0)):
+    for mode, opacity, image in (("BLEND", 0.5, np.full((2, 2), 128 / 255, np.float32)), ("OPAQUE", 1.0, None)):
         material = {"pbrMetallicRoughness": pbr, "alphaMode": mode}
         tree, _ = triangle(materials=[material], textures=[{"source": 0}], images=[{"uri": picture}])
         (read,) = loaded(tmp_path, tree).materials
-        assert read.alpha_image is None and read.opacity == pytest.approx(opacity)
+        assert np.array_equal(read.alpha_image, image) and read.opacity == pytest.approx(opacity)
         assert read.alpha_mode == mode.lower()
 
 

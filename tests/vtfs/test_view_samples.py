@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from vtfs.camera import Camera, Lens, Viewport, load_cameras
 from vtfs.gallery import build_scene
 from vtfs.scene import Material, Scene, load_scene
-from vtfs.tracer import Tracer, _bilinear
+from vtfs.tracer import Tracer, bilinear
 from vtfs.view_samples import trace_view_samples
 
 SHARED = Path(__file__).parents[2].parent / "shared" / "scenes"
@@ -180,12 +180,12 @@ def test_positions_are_exact_far_from_the_origin():
     assert_allclose(-trace_view_samples(moved, camera).position_m[..., 2], 5, rtol=1e-6)
 
 
-def test_bilinear_is_the_plain_sum_of_four_texels():
+def testbilinear_is_the_plain_sum_of_four_texels():
     rng = np.random.default_rng(0)
     image = rng.random((5, 3)).astype(np.float32)
     u, v = rng.uniform(-3, 3, (2, 100))
     expected = [oracle_texel(image, *at) for at in zip(u, v, strict=True)]
-    assert_allclose(_bilinear(image, u, v), expected, atol=1e-6)
+    assert_allclose(bilinear(image, u, v), expected, atol=1e-6)
 
 
 def test_the_cache_gives_the_same_samples_and_no_second_tracing(monkeypatch):

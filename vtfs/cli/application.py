@@ -14,6 +14,7 @@ from vtfs.cli.listings import doctor, scenes, techniques
 from vtfs.cli.predict import predict
 from vtfs.cli.render import render
 from vtfs.cli.report import report
+from vtfs.cli.stability import stability
 from vtfs.cli.tune import tune
 from vtfs.input_error import InputError
 
@@ -44,7 +45,7 @@ def _options(
     pass
 
 
-for _command in (tune, count, render, fit, predict, convert, report, scenes, techniques, doctor):
+for _command in (tune, count, render, stability, fit, predict, convert, report, scenes, techniques, doctor):
     app.command()(_command)
 
 _UsageError: Any = typer.BadParameter.__mro__[1]
@@ -71,7 +72,8 @@ def main() -> None:
     except BrokenPipeError:
         code = 1
     if code == _INTERRUPTED:
-        kept = "; what was measured is kept, --resume goes on from there" if _command_of(arguments) == "tune " else ""
+        resumes = _command_of(arguments) in ("tune ", "stability ")
+        kept = "; what was measured is kept, --resume goes on from there" if resumes else ""
         _leave(f"interrupted{kept}.", _INTERRUPTED)
     sys.exit(code if isinstance(code, int) else 0)
 

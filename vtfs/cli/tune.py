@@ -30,7 +30,7 @@ def tune(
     ] = None,
     space: Annotated[Path | None, typer.Option(help="Search space as TOML.", metavar="FILE")] = None,
     budget: Annotated[
-        str | None, typer.Option(help="Measurements, as 40, or seconds of measuring, as 120s.", show_default="90s")
+        str | None, typer.Option(help="Measurements, as 40, or seconds of measuring, as 120s.", show_default="40s")
     ] = None,
     objective: Annotated[
         str, typer.Option(help="`max`: the slowest frame decides; `mean`: the mean of the frames.")
@@ -70,8 +70,8 @@ def tune(
                 raise InputError(f"{name}: goes without --measurements, which measures nothing; leave one of them out.")
         recommend_imported(measurements, scene, names if techniques else None, objective, out, json_file)
         return
+    from tuning.budget import Budget
     from tuning.space import load_space
-    from tuning.sweep import Budget
     from vtfs.device import keep_compiled_programs
 
     budget_parsed = Budget.parse(budget) if budget is not None else None

@@ -30,7 +30,7 @@ _WHOLE = 2**21
 """Words of a level that are tested in one step on a GPU, whatever the chunk."""
 
 
-_MANY = 2**18
+_MANY = 2**19
 """From so many lights on, those near no cluster are dropped first."""
 
 

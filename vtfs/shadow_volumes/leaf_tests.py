@@ -1,4 +1,4 @@
-"""Volumes against the samples of the tiles or clusters that they reach: exact tests, in float64."""
+"""Volumes against the samples of the tiles or clusters that they reach: exact tests, in float64 unless asked."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vtfs.bit_lists import last_not_above, pack_bits
 from vtfs.node_lists import NodeLists
 from vtfs.shadow_mask import ShadowPlan
 from vtfs.shadow_volumes.hierarchy import Hierarchy
-from vtfs.shadow_volumes.planes import inside
+from vtfs.shadow_volumes.planes import Vector, inside
 from vtfs.shadow_volumes.volumes import Volumes
 
 _SAMPLES_AT_ONCE = {"cpu": 2**18}
@@ -21,7 +21,7 @@ def held_samples(
     lists: NodeLists, volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan
 ) -> UInt32[Array, "items words"]:
     """Which samples of each item's tile lie in a volume of its list."""
-    rows = _sample_rows(hierarchy, volume)
+    rows = sample_rows(hierarchy, volume)
     if plan.level_groups:
         bits = _tested_at_once(lists, volume, hierarchy, rows)
     else:
@@ -31,7 +31,7 @@ def held_samples(
     return _merged(bits, lists, hierarchy.tile_of_item.shape[0])
 
 
-def _sample_rows(hierarchy: Hierarchy, volume: Volumes) -> Float[Array, "tiles 4 lanes"]:
+def sample_rows(hierarchy: Hierarchy, volume: Volumes) -> Float[Array, "tiles 4 lanes"]:
     """Position of each sample of a tile, and its bias over its distance to the light."""
     samples = hierarchy.samples
     position = [samples.x_m, samples.y_m, samples.z_m]
@@ -41,6 +41,13 @@ def _sample_rows(hierarchy: Hierarchy, volume: Volumes) -> Float[Array, "tiles 4
     return jnp.stack([*position, moved], axis=1)
 
 
+def _about_light(row: Float[Array, "n 4 *lanes"], volume: Volumes) -> Vector:
+    """Samples relative to the light. Subtracted in float64, whatever the precision of the test: a scene far from its
+    origin loses nothing."""
+    relative = (row[:, c].astype(jnp.float64) - volume.origin_m[c] for c in range(3))
+    return tuple(c.astype(volume.edges.values.dtype) for c in relative)
+
+
 def _tested_at_once(lists: NodeLists, volume: Volumes, hierarchy: Hierarchy, rows) -> UInt32[Array, "groups words"]:
     """All groups in one reduction over a group's triangles and a word's samples."""
     capacity = lists.triangle.shape[0]
@@ -48,9 +55,9 @@ def _tested_at_once(lists: NodeLists, volume: Volumes, hierarchy: Hierarchy, row
     words = max(1, n_samples // 32)
     tile = hierarchy.tile_of_item[jnp.minimum(lists.nodes(), hierarchy.tile_of_item.shape[0] - 1)]
     row = rows.at[tile].get(mode="promise_in_bounds").reshape(capacity, 4, words, 1, n_samples // words)
-    position = tuple(row[:, c].astype(jnp.float64) - volume.origin_m[c] for c in range(3))
+    position = _about_light(row, volume)
     planes = jax.tree.map(lambda c: c[:, None, :, None], volume.edges.at(lists.triangle))
-    held = inside(planes, position, row[:, 3].astype(jnp.float64))
+    held = inside(planes, position, row[:, 3].astype(volume.edges.values.dtype))
     bits = held.astype(jnp.uint32) << jnp.arange(n_samples // words, dtype=jnp.uint32)
     bits = jax.lax.reduce(bits, jnp.uint32(0), jax.lax.bitwise_or, (2, 3))
     is_live = jnp.arange(capacity, dtype=jnp.int32) < lists.n_groups
@@ -74,8 +81,8 @@ def _tested_in_chunks(
         first, bits = state
         group = first + jnp.arange(chunk, dtype=jnp.int32)
         row = rows.at[jax.lax.dynamic_slice_in_dim(tile, first, chunk)].get(mode="promise_in_bounds")
-        position = tuple(row[:, c].astype(jnp.float64) - volume.origin_m[c] for c in range(3))
-        moved = row[:, 3].astype(jnp.float64)
+        position = _about_light(row, volume)
+        moved = row[:, 3].astype(volume.edges.values.dtype)
         planes = volume.edges.at(jax.lax.dynamic_slice_in_dim(triangles, first, chunk))
         held = jnp.zeros((chunk, n_samples), bool)
         for lane in range(lanes):
@@ -137,12 +144,12 @@ def held_counts(
         group = first + jnp.arange(chunk, dtype=jnp.int32)
         item = jax.lax.dynamic_slice_in_dim(item_of_group, first, chunk)
         row = rows[tile_of_item[item]]
-        position = tuple(row[:, c].astype(jnp.float64) - volume.origin_m[c] for c in range(3))
+        position = _about_light(row, volume)
         planes = volume.edges.at(jax.lax.dynamic_slice_in_dim(triangle, first, chunk))
         held = jnp.zeros((chunk, n_samples), jnp.int32)
         for lane in range(lanes):
             one = jax.tree.map(lambda c, lane=lane: c[:, lane : lane + 1], planes)
-            held = held + inside(one, position, jnp.float64(0)).astype(jnp.int32)
+            held = held + inside(one, position, jnp.zeros((), position[0].dtype)).astype(jnp.int32)
         item = jnp.where(group < n_groups, item, n_items)
         return first + chunk, total.at[item].add(held, mode="drop")
 

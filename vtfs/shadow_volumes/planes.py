@@ -28,13 +28,23 @@ Extra = Literal["off", "vertex", "silhouette"]
 planes that meet there (Sintorn et al. 2014, Sec. 3), or those of them that also hold the eye and bound the volume on
 the screen (the silhouette edges of Sintorn et al. 2011, Sec. 4.2)."""
 
+Precision = Literal["float64", "float32"]
+"""Of the test of a sample against planes."""
+
 SMALLEST_VOLUME = 1e-10
 """A triangle is left out where its signed volume with the light is below this share of the product of edge normals and
 vertices that it is summed from: it is seen edge-on, or narrower than 1e-10 rad. Rounding (2^-52) then moves the border
 of what is kept by at most 1e-5 of its size, and its orientation is certain."""
 
+LEAST_HEIGHT = 1e-12
+"""A triangle is left out, too, where its volume with the light is below this share of two of its edges times the
+distance of a vertex: rounding is far below, and decides alone where the light is at a vertex."""
+
 BELOW_ZERO = -1e-300
 """Below zero, above every product that is not zero, and no subnormal, which some devices take for zero."""
+
+_BELOW_ZERO_32 = -2e-38
+"""The same in float32."""
 
 PAD = 16 * 2.0**-24
 """Relative error bound of a float32 plane test: under eight roundings, each 2^-24, of every product; doubled."""
@@ -145,6 +155,10 @@ def edge_planes(
     volume = -dot(face, light_m) if directional else dot(face, corner[0])
     bound = sum(length(normals[k]) * length(corner[k]) for k in range(3))
     safe = (jnp.abs(volume) > SMALLEST_VOLUME * bound) & jnp.isfinite(bound)
+    if not directional:
+        # Where the light is at a vertex the bound vanishes, and the volume is rounding.
+        edge_1, edge_2 = minus(corner[1], corner[0]), minus(corner[2], corner[0])
+        safe = safe & (jnp.abs(volume) > LEAST_HEIGHT * length(edge_1) * length(edge_2) * length(corner[0]))
     # Counter-clockwise as seen from the light: it sees the front.
     safe = safe & ~(culls_front & (volume < 0))
     inward = jnp.where(safe, jnp.where(volume > 0, 1.0, -1.0), 0.0)
@@ -162,6 +176,14 @@ def edge_planes(
         last((dot(face, corner[0]) + bias_m * volume if directional else volume) * inward, jnp.inf),
     )
     return planes, inward
+
+
+def in_precision(planes: EdgePlanes, precision: Precision) -> EdgePlanes:
+    """The planes as a test in another precision reads them: rounded, ties broken as before."""
+    if precision == "float64":
+        return planes
+    least = tuple(jnp.where(value < 0, jnp.float32(_BELOW_ZERO_32), jnp.float32(0)) for value in planes.least)
+    return eqx.tree_at(lambda p: p.least, jax.tree.map(lambda c: c.astype(jnp.float32), planes), least)
 
 
 def inside(planes: EdgePlanes, sample: Vector, moved: Float[Array, "*n"]) -> Bool[Array, "*n"]:

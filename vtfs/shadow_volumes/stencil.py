@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vtfs.bounds import Aabb
 from vtfs.gbuffer import Positions
-from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
+from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan, Stencil
 from vtfs.shadow_volumes.hierarchy import Hierarchy, node_table
 from vtfs.shadow_volumes.merge import mask_of
 from vtfs.shadow_volumes.planes import (
@@ -26,12 +26,14 @@ from vtfs.shadow_volumes.planes import (
     SMALLEST_VOLUME,
     EdgePlanes,
     NodePlanes,
+    Precision,
     Vector,
     corners,
     cross,
     dot,
     edge_planes,
     first_is_positive,
+    in_precision,
     inside,
     length,
     minus,
@@ -40,7 +42,7 @@ from vtfs.shadow_volumes.planes import (
     unit,
 )
 from vtfs.shadow_volumes.ptsv import over_tiles
-from vtfs.shadow_volumes.sample_tiles import SampleTiles, sample_tiles, tile_order
+from vtfs.shadow_volumes.sample_tiles import SampleTiles, in_runs, sample_tiles, tile_order
 from vtfs.shadow_volumes.volumes import Volumes, light_m, origin_m, rotated
 from vtfs.shadow_volumes.walk import Walk, count_volumes
 
@@ -77,10 +79,45 @@ class StencilWalk(eqx.Module):
     walk: Walk
 
 
+class PolygonCounts(eqx.Module):
+    """What is drawn over each sample, whatever the stencil: `is_set` tells the shadow from it.
+
+    - `around_eye`: volumes that hold the eye. `adding`, `taking`: polygons that add to the stencil, and take from it.
+    """
+
+    around_eye: Int[Array, ""]
+    adding: Int[Array, "*samples"]
+    taking: Int[Array, "*samples"]
+
+
+def is_set(counts: PolygonCounts, stencil: Stencil, starts_around_eye: bool) -> Bool[Array, "*samples"]:
+    """Is a sample's stencil not zero in the end? For arrays of JAX or NumPy.
+
+    **Arguments:**
+
+    - `starts_around_eye`: the stencil starts with the volumes around the eye; never for z-fail.
+    """
+    added = counts.around_eye * starts_around_eye + counts.adding
+    if stencil == "saturate":  # all that add are drawn first, and leave no more than the largest value
+        return (added > counts.taking) & (counts.taking < _LARGEST)
+    if stencil == "wrap":
+        return (added - counts.taking) % (_LARGEST + 1) != 0
+    return added != counts.taking
+
+
 def stencil_mask(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> ShadowMask:
     """Shadows by counting the polygons before each sample (z-pass) or behind it (z-fail)."""
     polygons, hierarchy = shadow_planes(frame, plan, by_failing), shadow_build(frame, plan)
     return shadow_merge(polygons, hierarchy, shadow_traverse(polygons, hierarchy, plan, by_failing), plan, by_failing)
+
+
+def count_polygons(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> tuple[PolygonCounts, Bool[Array, ""]]:
+    """What is drawn over each sample, in runs, and whether some list overflowed: then it means nothing."""
+    polygons, hierarchy = shadow_planes(frame, plan, by_failing), shadow_build(frame, plan)
+    walk = shadow_traverse(polygons, hierarchy, plan, by_failing)
+    samples, counts = hierarchy.samples, _over_samples(polygons, hierarchy, walk, by_failing)
+    adding, taking = (in_runs(c, samples.viewport, samples.tile_px) for c in (counts.adding, counts.taking))
+    return PolygonCounts(counts.around_eye, adding, taking), walk.walk.overflowed | hierarchy.overflowed
 
 
 def shadow_planes(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> StencilPolygons:
@@ -109,7 +146,7 @@ def shadow_traverse(polygons: StencilPolygons, hierarchy: Hierarchy, plan: Shado
 
     def count(crossing: Array) -> tuple[Array, Walk]:
         drawn = polygons.polygons.crossing == crossing
-        return count_volumes(_seen_volumes(polygons.polygons, drawn, by_failing), hierarchy, plain)
+        return count_volumes(_seen_volumes(polygons.polygons, drawn, by_failing, plan.precision), hierarchy, plain)
 
     # One after the other by the same code: it is compiled once.
     (entered, left), walks = jax.lax.map(count, jnp.array([1, -1], jnp.int32))
@@ -120,19 +157,21 @@ def shadow_merge(
     polygons: StencilPolygons, hierarchy: Hierarchy, walk: StencilWalk, plan: ShadowPlan, by_failing: bool
 ) -> ShadowMask:
     """Samples whose stencil is not zero."""
-    entered, left = walk.entered, walk.left
-    added, taken = (left, entered) if by_failing else (entered, left)
-    before = polygons.around_eye if plan.around_eye and not by_failing else jnp.int32(0)
-    if plan.stencil == "saturate":  # all that add are drawn first
-        is_set = jnp.maximum(jnp.minimum(before + added, _LARGEST) - taken, 0) > 0
-    elif plan.stencil == "wrap":
-        is_set = (before + added - taken) % (_LARGEST + 1) != 0
-    else:
-        is_set = before + added != taken
-    receives, item = hierarchy.samples.receives, hierarchy.item_of_sample[:, 0]
-    updates = jnp.sum(jnp.where(receives, (added + taken)[item], 0), dtype=jnp.int64)
-    mask = mask_of(receives & is_set[item], walk.walk, polygons.casts, hierarchy)
+    counts = _over_samples(polygons, hierarchy, walk, by_failing)
+    shadowed = is_set(counts, plan.stencil, plan.around_eye and not by_failing)
+    receives = hierarchy.samples.receives
+    updates = jnp.sum(jnp.where(receives, counts.adding + counts.taking, 0), dtype=jnp.int64)
+    mask = mask_of(receives & shadowed, walk.walk, polygons.casts, hierarchy)
     return eqx.tree_at(lambda mask: mask.counts.stencil_updates, mask, updates)
+
+
+def _over_samples(
+    polygons: StencilPolygons, hierarchy: Hierarchy, walk: StencilWalk, by_failing: bool
+) -> PolygonCounts:
+    """What is drawn over each sample, in tiles."""
+    entered, left = (c[hierarchy.item_of_sample[:, 0]] for c in (walk.entered, walk.left))
+    added, taken = (left, entered) if by_failing else (entered, left)
+    return PolygonCounts(polygons.around_eye, added, taken)
 
 
 _LARGEST = 255
@@ -206,7 +245,7 @@ def _polygons(
     return Polygons(both, finite, jnp.concatenate(index), jnp.concatenate(drawn))
 
 
-def _seen_volumes(polygons: Polygons, drawn: Bool[Array, " polygons"], before: bool) -> Volumes:
+def _seen_volumes(polygons: Polygons, drawn: Bool[Array, " polygons"], before: bool, precision: Precision) -> Volumes:
     """The volumes of polygons as seen from the eye: beyond them, or `before` them.
 
     With barycentric weights that sum to the product of the face's normal over vertices at finite places, one formula
@@ -253,6 +292,7 @@ def _seen_volumes(polygons: Polygons, drawn: Bool[Array, " polygons"], before: b
         tuple(narrow(unit(normal)) for normal in normals), narrow(unit(face)), (),
         (last(offset, jnp.inf).astype(jnp.float32),),
     )  # fmt: skip
+    edges = in_precision(edges, precision)
     zero = jnp.zeros(3, jnp.float64)
     return Volumes(plane_table(edges), plane_table(nodes), keeps, jnp.zeros(keeps.shape), tuple(zero), jnp.float64(0))
 

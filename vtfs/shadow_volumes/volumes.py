@@ -16,6 +16,7 @@ from vtfs.shadow_volumes.planes import (
     cross,
     dot,
     edge_planes,
+    in_precision,
     length,
     minus,
     node_planes,
@@ -69,6 +70,7 @@ def volumes(frame: ShadowFrame, plan: ShadowPlan, about_light: bool) -> Volumes:
     edges, inward = edge_planes(vertex, frame.triangles, light, frame.directional, frame.bias_m, frame.culls_front)
     nodes = node_planes(edges, inward, vertex, frame.triangles, light, frame.directional, plan.extra, about_light)
     seen = _solid_angle(corners(vertex, frame.triangles), light, frame.directional)
+    edges = in_precision(edges, plan.precision)
     return Volumes(plane_table(edges), plane_table(nodes), inward != 0, seen, origin_m(frame), frame.bias_m)
 
 

@@ -230,13 +230,18 @@ def too_many(groups: Int[Array, " levels_and_1"], plan: ShadowPlan) -> Bool[Arra
 
 def count_volumes(volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> tuple[Int[Array, "items lanes"], Walk]:
     """In how many volumes each sample of the items' tiles lies; the walk's own bits are empty."""
+    at, walk = to_items(volume, hierarchy, plan)
+    return held_counts(at.lists, at.cover, volume, hierarchy), walk
+
+
+def to_items(volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> tuple[AtLevel, Walk]:
+    """All triangles down to the lists of the items, in one batch and one pass; no sample is tested here."""
     n_triangles, n_levels = volume.safe.shape[0], len(hierarchy.table.level_nodes)
     root = AtLevel(
         one_list(volume.safe, LANES, n_triangles), jnp.zeros(1, bool), jnp.zeros(1, jnp.int32),
         jnp.zeros(n_shadowed_places(hierarchy), bool), no_counts(n_levels, n_triangles),
     )  # fmt: skip
     at = descend(root, 0, n_levels, volume, hierarchy, plan)
-    total = held_counts(at.lists, at.cover, volume, hierarchy)
     n_items = hierarchy.tile_of_item.shape[0]
     length = at.lists.count[:n_items]
     own_length = length[jnp.clip(hierarchy.item_of_sample, 0, n_items - 1)]
@@ -246,4 +251,4 @@ def count_volumes(volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> tu
         jnp.sum(length.astype(jnp.int64) * hierarchy.n_in_tile), none.dropped_samples, none.n_pairs,
         too_many(at.counts.groups, plan),
     )  # fmt: skip
-    return total, walk
+    return at, walk

@@ -1,0 +1,194 @@
+"""Alpha casters: are they exact, what do they cost, and what do several samples a pixel gain?
+
+python benchmarks/alpha_shadows.py exactness [SIZE]      variants against float64, gallery scenes
+python benchmarks/alpha_shadows.py antialiasing [WxH]    4, 8, 16 samples, traced against extrapolated
+python benchmarks/alpha_shadows.py cost [WxH]            opaque alone, and with alpha casters, beside brute force
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import jax
+import numpy as np
+
+from vtfs.alpha_casters import AlphaCasters, Blending, SceneCasters, scene_casters
+from vtfs.camera import Viewport
+from vtfs.gallery import build_scene
+from vtfs.sample_patterns import extrapolated_sub_samples, resolved, traced_sub_samples
+from vtfs.scene import Scene
+from vtfs.shadow_casters import ShadowLight
+from vtfs.shadow_mask import ShadowPlan, facing_samples
+from vtfs.shadow_references import brute_force, classify, view_points_m
+from vtfs.tracer import Tracer
+from vtfs.transmittance_references import ReferenceLight, brute_force_transmittance
+from vtfs.transmitted_light import scene_bias_m, transmitted_light
+from vtfs.view_samples import ViewSamples, trace_view_samples
+
+_VARIANTS: tuple[tuple[str, ShadowPlan, Blending], ...] = (
+    ("cluster_hierarchy", ShadowPlan(8, 8), "grey"),
+    ("cluster_hierarchy", ShadowPlan(16, 4, bounds="implicit", extra="off"), "coloured"),
+    ("ptsv", ShadowPlan(5, 16, extra="off"), "coloured"),
+    ("ptsv", ShadowPlan(8, 32, extra="silhouette"), "stochastic"),
+)
+_BLENDINGS: tuple[Blending, ...] = ("grey", "coloured", "stochastic")
+
+
+def main() -> None:
+    question, size = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else ""
+    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {' '.join(sys.argv[1:])}\n")
+    if question == "exactness":
+        exactness(int(size or 128))
+    else:
+        width, height = map(int, (size or "320x180").split("x"))
+        (antialiasing if question == "antialiasing" else cost)(Viewport(width, height))
+
+
+def light_in(scene: Scene, at: tuple[float, float, float]) -> ShadowLight:
+    low, high = scene.bounds_m
+    return ShadowLight(tuple(low + (high - low) * np.array(at)))
+
+
+# --- exactness ------------------------------------------------------------------------------------------------------
+
+
+def exactness(size_px: int) -> None:
+    """Techniques, plans and blendings against the product over all triangles."""
+    print("| scene | view | technique | plan | blending | samples | largest error | in bands | errors |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    for name, n_triangles, frame, at in (
+        ("conservatory", 12_000, 12, (0.45, 1.2, 0.8)),
+        ("grove", 12_000, 5, (0.4, 1.1, 0.6)),
+    ):
+        scene = build_scene(name, n_triangles)
+        assert scene.cameras is not None
+        samples = trace_view_samples(scene, replace(scene.cameras.camera(frame), viewport=Viewport(size_px, size_px)))
+        casters, light = scene_casters(scene), light_in(scene, at)
+        views = [("solid", samples), *((f"layer {k}", v.samples) for k, v in enumerate(samples.layers.transparent))]
+        for (technique, plan, blending), (label, view) in itertools.product(_VARIANTS, views[:3]):
+            receives = facing_samples(view, light)
+            reference = _Reference(view, receives, casters, light, blending)
+            found = transmitted_light(
+                technique, plan, view, casters, light, blending, reference.stream, receives=receives
+            )
+            row = reference.compared(found.transmittance[receives])
+            text = f"{plan.tile_px} px, b={plan.branching}, {plan.bounds}, extra {plan.extra}"
+            print(f"| {name} {frame} | {label} | {technique} | {text} | {blending} | {row} |", flush=True)
+
+
+class _Reference:
+    """The light that float64 says, and how a result compares with it."""
+
+    stream = (1, 2)
+
+    def __init__(
+        self, view: ViewSamples, receives: np.ndarray, casters: SceneCasters, light: ShadowLight, blending: Blending
+    ):
+        self.casters, self.light = casters, light
+        self.bias_m, self.eye_m = scene_bias_m(casters), np.array(view.camera.eye_m)
+        self.points_m = view_points_m(view, receives)
+        pixel = np.flatnonzero(receives.ravel())
+        rest = (light, self.bias_m, self.eye_m)
+        self.opaque = brute_force(self.points_m, casters.opaque, *rest)
+        self.alpha: ReferenceLight = brute_force_transmittance(
+            self.points_m, casters.alpha, *rest, blending, pixel, self.stream
+        )
+
+    def compared(self, found: np.ndarray) -> str:
+        """Samples, the largest error outside the bands, samples in the bands, and others that are off by over 1e-5."""
+        n = len(self.points_m)
+        expected = np.where(self.opaque if found.ndim == 1 else self.opaque[:, None], 0, self.alpha.transmittance)
+        error = np.abs(found - expected).reshape(n, -1).max(axis=1)
+        differs = (error > 1e-5) & (self.alpha.cutoff_margin > 1e-9)
+        largest = float(error[error <= 1e-5].max(initial=0))
+        total = int(differs.sum())
+        for part in (self.casters.opaque, self.casters.alpha.casters):
+            bands = classify(self.points_m, differs, part, self.light, self.bias_m, self.eye_m)
+            differs = np.isin(np.arange(n), bands.error_points)
+        return f"{n:,} | {largest:.1e} | {total - int(differs.sum())} | {int(differs.sum())}"
+
+
+# --- several samples a pixel ----------------------------------------------------------------------------------------
+
+
+def antialiasing(viewport: Viewport) -> None:
+    """Coverage by traced and by extrapolated sub-samples; 16 traced ones are the yardstick of fewer."""
+    print("| scene | samples | positions | off by over 1/32 | mean error | RMS error | RMS, one triangle |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for name, n_triangles, frame, at in (
+        ("conservatory", 12_000, 12, (0.45, 1.2, 0.8)),
+        ("grove", 12_000, 5, (0.4, 1.1, 0.6)),
+    ):
+        scene = build_scene(name, n_triangles)
+        assert scene.cameras is not None
+        camera, tracer = replace(scene.cameras.camera(frame), viewport=viewport), Tracer(scene)
+        casters, light = scene_casters(scene), light_in(scene, at)
+        centre = trace_view_samples(scene, camera, tracer)
+        views = {n: traced_sub_samples(scene, camera, n, tracer) for n in (16, 8, 4, 1)}
+        traced = {n: _coverage(of_n, casters, light) for n, of_n in views.items()}
+        is_one = centre.valid & np.all([view.triangle == centre.triangle for view in views[16]], axis=0)
+        for n in (1, 4, 8, 16):
+            rows = [("traced, against 16", traced[n], traced[16])] if n < 16 else []
+            if n > 1:
+                extrapolated = _coverage(extrapolated_sub_samples(centre, n), casters, light)
+                rows.append((f"extrapolated, against {n} traced", extrapolated, traced[n]))
+            for label, coverage, against in rows:
+                off, inside = np.abs(coverage - against)[centre.valid], np.abs(coverage - against)[is_one]
+                figures = f"{(off > 1 / 32).mean():.1%} | {off.mean():.4f} | {np.sqrt((off**2).mean()):.4f}"
+                print(f"| {name} | {n} | {label} | {figures} | {np.sqrt((inside**2).mean()):.4f} |", flush=True)
+
+
+def _coverage(views: tuple[ViewSamples, ...], casters: SceneCasters, light: ShadowLight) -> np.ndarray:
+    """How much light is left of each pixel."""
+    plan = ShadowPlan(8, 8)
+    found = [transmitted_light("ptsv", plan, view, casters, light) for view in views]
+    return resolved([each.transmittance for each in found], views)
+
+
+# --- cost -----------------------------------------------------------------------------------------------------------
+
+
+def cost(viewport: Viewport) -> None:
+    """Wall time of calls after the first: what alpha casters take beside opaque ones."""
+    print("| scene | opaque / alpha triangles | samples | casters | ms | test-and-set |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for name, frame, at in (("conservatory", 12, (0.45, 1.2, 0.8)), ("grove", 5, (0.4, 1.1, 0.6))):
+        scene = build_scene(name)
+        assert scene.cameras is not None
+        samples = trace_view_samples(scene, replace(scene.cameras.camera(frame), viewport=viewport))
+        whole, light = scene_casters(scene), light_in(scene, at)
+        receives = facing_samples(samples, light)
+        opaque_too = f"{whole.opaque.n_triangles:,} / {whole.alpha.casters.n_triangles:,}"
+        for label, casters, blending in _caster_sets(whole):
+            for technique in ("ptsv", "cluster_hierarchy"):
+                ms, found = [], None
+                for _ in range(3):
+                    start = time.perf_counter()
+                    found = transmitted_light(
+                        technique, ShadowPlan(8, 8), samples, casters, light, blending, receives=receives
+                    )
+                    ms.append((time.perf_counter() - start) * 1e3)
+                assert found is not None
+                tests = found.opaque.counts["test_and_set"] + found.alpha.counts["test_and_set"]
+                print(
+                    f"| {name} | {opaque_too} | {int(receives.sum()):,} | {label}, {technique} | "
+                    f"{min(ms[1:]):,.0f} | {tests:,} |",
+                    flush=True,
+                )
+
+
+def _caster_sets(whole: SceneCasters) -> Iterator[tuple[str, SceneCasters, Blending]]:
+    none: AlphaCasters = whole.alpha.kept(np.zeros(0, int))
+    yield "opaque alone", SceneCasters(whole.opaque, none), "grey"
+    plain = replace(whole.alpha, image=np.full(whole.alpha.casters.n_triangles, -1))
+    yield "with alpha, no images", SceneCasters(whole.opaque, plain), "grey"
+    for blending in _BLENDINGS:
+        yield f"with alpha, {blending}", whole, blending
+
+
+if __name__ == "__main__":
+    main()
