@@ -32,6 +32,7 @@ from vtfs.shadow_volumes.sample_tiles import KEY_BITS
 from vtfs.shadow_volumes.z_fail import z_fail
 from vtfs.shadow_volumes.z_pass import z_pass
 from vtfs.view_samples import ViewSamples
+from vtfs.wide_tree import inner_level_nodes
 
 if TYPE_CHECKING:
     from vtfs.camera import Camera
@@ -214,10 +215,24 @@ def fitted_to_all(
             raise InputError(f"{technique}: the frame fits no capacity; use larger tiles or a batch.")
         plan = grown
     if jax.default_backend() != "cpu" if unrolled is None else unrolled:
-        levels = tuple(_rounded_up_finely(int(n)) for n in needed[1:-1])
-        if levels:
-            plan = replace(plan, level_groups=levels, leaf_groups=_rounded_up_finely(int(needed[-1])), groups=0)
+        plan = _unrolled(plan, needed, max(int(mask.counts.n_blocks) for mask in masks))
     return plan, masks
+
+
+def _unrolled(plan: ShadowPlan, needed: np.ndarray, n_blocks: int) -> ShadowPlan:
+    """The plan with what each level needs, and no more clusters than there are.
+
+    With fewer clusters the tree may lose levels above what is now the root, each of one node: those below keep their
+    lists. A level to restart from is counted from the root, so that two passes keep them all.
+    """
+    levels = tuple(_rounded_up_finely(int(n)) for n in needed[1:-1])
+    clusters = _rounded_up_finely(n_blocks) if n_blocks and not plan.cells else plan.clusters
+    n_inner = len(inner_level_nodes(clusters, plan.branching))
+    if n_blocks and not plan.cells and (n_inner == len(levels) or (plan.passes == 1 and n_inner)):
+        plan, levels = replace(plan, clusters=clusters), levels[len(levels) - n_inner :]
+    if not levels:
+        return plan
+    return replace(plan, level_groups=levels, leaf_groups=_rounded_up_finely(int(needed[-1])), groups=0)
 
 
 def _rounded_up_finely(needed: int) -> int:

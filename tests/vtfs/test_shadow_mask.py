@@ -306,12 +306,14 @@ def test_what_does_not_fit_is_refused_and_run_again_not_cut():
     samples, casters = surface_samples(camera, 3), soup(camera, rng)
     light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
     whole = cast("cluster_hierarchy", CLUSTERS, samples, casters, light, bias_m)
-    small = replace(CLUSTERS, branching=32, leaf_groups=4)
+    small = replace(CLUSTERS, branching=4, leaf_groups=4)
     with pytest.raises(InputError, match="no longer fits"):
         cast("cluster_hierarchy", small, samples, casters, light, bias_m)
     frame = shadow_frame(samples, casters_on_device(casters), light, shadow_grid(samples, 8), bias_m)
     plan = fitted("cluster_hierarchy", small, frame, unrolled=True)
-    assert plan.leaf_groups > 4 and plan.level_groups
+    assert plan.leaf_groups > 4
+    # No more clusters than there are, and none of the levels that only the rounding of their number made: there were 4.
+    assert plan.clusters < CLUSTERS.clusters and 0 < len(plan.level_groups) < 4
     # The program that is timed, as a GPU runs it: another branching, no loops, and the same mask.
     with jax.enable_x64(True):
         shadowed, overflowed = shadow_program("cluster_hierarchy", plan)(frame)
