@@ -78,12 +78,14 @@ def test_shadows_are_checked_and_timed(tmp_path):
     space.write_text("[parameters]\nbranching = [32]\n")
     with short_repeats():
         ran = vtfs(
-            "tune", *files("zdm2"), *SIZE, *LIGHTS, "--shadow-lights", "2", "--techniques", "cluster_hierarchy",
-            "--space", space, "--budget", "1", "--out", tmp_path / "out",
+            "tune", *files("zdm2"), "--size", "160x90", *LIGHTS, "--shadow-lights", "2",
+            "--techniques", "cluster_hierarchy", "--space", space, "--budget", "1", "--out", tmp_path / "out",
         )  # fmt: skip
     assert ran.code == 0 and ran.err == ""
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["kind"] == "shadows" and result["measured"] == 1 and result["failed"] == 0
     assert result["best"]["error"] < 1e-4
     counts = result["counts"]["cluster_hierarchy"]
-    assert counts["shadow_lights"] == 2 and counts["casters"] > 20_000 and counts["test_and_set"] > 1e6
+    assert (
+        counts["shadow_lights"] == 2 and counts["casters"] > 20_000 and counts["test_and_set"] > counts["casters"]
+    )
