@@ -13,7 +13,8 @@ import numpy as np
 
 from vtfs.camera import Viewport
 from vtfs.false_positives import ListedPairs, listed_pairs
-from vtfs.frame import FrameInputs, run_stages
+from vtfs.frame import run_stages
+from vtfs.frame_inputs import FrameInputs
 from vtfs.parameters import Configuration, Value, configuration
 from vtfs.scene_setup import SceneOptions, set_up
 

@@ -33,7 +33,9 @@ from tests.strategies import (
 )
 from tests.strategies import surface_samples as smooth_samples
 from vtfs.camera import Camera, Lens, Viewport
-from vtfs.frame import NO_SIZES, FrameInputs, run_stages
+from vtfs.frame import run_stages
+from vtfs.frame_inputs import FrameInputs
+from vtfs.frame_sizes import NO_SIZES
 from vtfs.input_error import InputError
 from vtfs.light_volumes import LightPixels
 from vtfs.lights import Lights, cone_cosines

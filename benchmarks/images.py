@@ -15,7 +15,8 @@ import numpy as np
 
 from vtfs.camera import Viewport
 from vtfs.device import keep_compiled_programs
-from vtfs.frame import FrameInputs, render
+from vtfs.frame import render
+from vtfs.frame_inputs import FrameInputs
 from vtfs.gallery import GALLERY
 from vtfs.parameters import SHADOW_NAMES, TECHNIQUES, configuration
 from vtfs.reference import forward_reference, largest_relative_difference

@@ -30,15 +30,10 @@ import numpy as np
 from vtfs.camera import Viewport
 from vtfs.device import device_name
 from vtfs.files import write_atomically
-from vtfs.frame import (
-    CapacityError,
-    FrameInputs,
-    count,
-    frame_program,
-    planned,
-    run_stages,
-    stage_program,
-)
+from vtfs.frame import frame_program, planned, run_stages, stage_program
+from vtfs.frame_counts import count
+from vtfs.frame_inputs import FrameInputs
+from vtfs.frame_sizes import CapacityError
 from vtfs.lights import Lights, point_lights, scatter_lights
 from vtfs.parameters import configuration
 from vtfs.scene_setup import SceneOptions, SceneSetup, set_up

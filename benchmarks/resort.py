@@ -16,7 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from vtfs.camera import Viewport
-from vtfs.frame import FrameInputs, count
+from vtfs.frame_counts import count
+from vtfs.frame_inputs import FrameInputs
 from vtfs.light_lists import view_lights
 from vtfs.lights import Lights
 from vtfs.parameters import configuration

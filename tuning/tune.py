@@ -24,7 +24,7 @@ from tuning.sweep import SearchResult, search
 from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_counts
 from vtfs.device import versions
 from vtfs.files import write_atomically
-from vtfs.frame import FrameInputs
+from vtfs.frame_inputs import FrameInputs
 from vtfs.parameters import Configuration, casts_shadows, configuration
 from vtfs.scene_setup import SceneSetup
 

@@ -22,21 +22,10 @@ from tuning.timing import interleaved_ms, repeats_ms, timed_ms
 from vtfs.cache import cached
 from vtfs.cell_maps import CellMaps, cell_maps
 from vtfs.device import device_name, versions
-from vtfs.frame import (
-    NO_SIZES,
-    CapacityError,
-    FrameCounts,
-    FrameInputs,
-    Sizes,
-    cast_program,
-    count,
-    frame_program,
-    image_on_host,
-    is_listed,
-    planned,
-    run_stages,
-    stage_program,
-)
+from vtfs.frame import cast_program, frame_program, image_on_host, is_listed, planned, run_stages, stage_program
+from vtfs.frame_counts import FrameCounts, count
+from vtfs.frame_inputs import FrameInputs
+from vtfs.frame_sizes import NO_SIZES, CapacityError, Sizes
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
 from vtfs.op_counts import ListLengths, OpCounts

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from vtfs.frame import FrameInputs, lengths_of, run_stages
+from vtfs.frame import run_stages
+from vtfs.frame_counts import lengths_of
+from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
 from vtfs.light_volumes import lights_of_samples
 from vtfs.parameters import Configuration, configuration, lists_configuration
@@ -68,4 +70,4 @@ def _reaching(inputs: FrameInputs, light_cutoff: float) -> np.ndarray:
     """Lights that reach each visible sample, `[runs, 32]`: those that the stencil lets through."""
     config = configuration("deferred_stencil", {"light_cutoff": light_cutoff})
     env: dict[str, Any] = run_stages(config, inputs, until="assign")[0]
-    return np.asarray(lights_of_samples(env["assign"], env["positions"].n_visible_runs))
+    return lights_of_samples(env["assign"], env["positions"].n_visible_runs)

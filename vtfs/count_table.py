@@ -7,7 +7,8 @@ import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from vtfs.frame import FrameCounts, KeptStages, count
+from vtfs.frame import KeptStages
+from vtfs.frame_counts import FrameCounts, count
 from vtfs.op_counts import OpCounts
 from vtfs.parameters import GRID_PARAMETERS, Configuration, counted_configuration
 from vtfs.scene_setup import SceneSetup

@@ -8,6 +8,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from vtfs.bit_lists import WORD_BITS, gather_hits, pack_bits
@@ -149,7 +150,10 @@ def _widened(part: GBuffer) -> Surface:
     return jax.tree.map(lambda channel: channel.astype(jnp.float32), surface_of(part))
 
 
-def lights_of_samples(pixels: LightPixels, n_runs: int) -> Int[Array, "runs 32"]:
-    """How many lights shade each pixel."""
-    bits = (pixels.mask[:, None] >> jnp.arange(RUN, dtype=jnp.uint32)[None, :]) & 1
-    return jnp.zeros((n_runs, RUN), jnp.int32).at[pixels.run].add(bits.astype(jnp.int32), mode="drop")
+def lights_of_samples(pixels: LightPixels, n_runs: int) -> np.ndarray:
+    """How many lights shade each pixel, int32 `[runs, 32]`. On the host, lane by lane: all bits at once are 128 bytes a
+    pair."""
+    n_pairs = int(pixels.total)
+    run, mask = np.asarray(pixels.run)[:n_pairs], np.asarray(pixels.mask)[:n_pairs]
+    lanes = [np.bincount(run[(mask >> np.uint32(lane)) & 1 == 1], minlength=n_runs) for lane in range(RUN)]
+    return np.stack(lanes, axis=1).astype(np.int32)

@@ -59,7 +59,7 @@ def light_volume_lengths(positions: Positions, pixels: LightPixels, n_lights: in
     """What deferred shading has: the lights that cover each pixel; transparent samples take every light."""
     valid = np.asarray(positions.valid)
     of_run = np.where(valid, n_lights, 0).astype(np.int64)
-    of_run[: positions.n_visible_runs] = np.asarray(lights_of_samples(pixels, positions.n_visible_runs))
+    of_run[: positions.n_visible_runs] = lights_of_samples(pixels, positions.n_visible_runs)
     of_block = np.full(positions.n_transparent_runs, n_lights, np.int64)
     return _lengths(of_run, positions, np.empty(0, np.int64), of_block, 0)
 

@@ -23,7 +23,7 @@ from vtfs.scene import Scene, load_scene
 from vtfs.view_samples import Tracer, ViewSamples, trace_view_samples
 
 if TYPE_CHECKING:
-    from vtfs.frame import FrameInputs
+    from vtfs.frame_inputs import FrameInputs
     from vtfs.shadow_inputs import ShadowScene
 
 log = logging.getLogger("vtfs.scene_setup")

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vtfs.frame import FrameInputs, cast_counted
+from vtfs.frame import cast_counted
+from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
 from vtfs.parameters import SHADOW_REFERENCES, Configuration
 from vtfs.techniques import REGISTRY

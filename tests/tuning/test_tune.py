@@ -14,7 +14,8 @@ import tuning.workload
 from tests.command_line import SMALL, finished, full_disk, is_refused, short_repeats, started, vtfs
 from tuning.record import read_measurements
 from vtfs.camera import Viewport, save_cameras
-from vtfs.frame import CapacityError, frame_program
+from vtfs.frame import frame_program
+from vtfs.frame_sizes import CapacityError
 from vtfs.gallery import build_scene
 from vtfs.gbuffer_files import save_gbuffer
 from vtfs.lights import save_lights

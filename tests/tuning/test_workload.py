@@ -18,7 +18,8 @@ from tuning.tune import choose_frames
 from tuning.workload import LOST, ScenePath, SceneWorkload, busiest_frames, cached_counts
 from vtfs.camera import Viewport
 from vtfs.device import keep_compiled_programs
-from vtfs.frame import FrameInputs, count
+from vtfs.frame_counts import count
+from vtfs.frame_inputs import FrameInputs
 from vtfs.parameters import TUNED_TECHNIQUES, configuration
 from vtfs.scene_setup import SceneOptions, set_up
 

@@ -14,7 +14,8 @@ from PIL import Image
 
 from tests.command_line import ROOT, SMALL, STREET, Ran, finished, full_disk, is_refused, started, vtfs
 from vtfs.camera import Viewport, load_cameras, save_cameras
-from vtfs.frame import FrameInputs, count
+from vtfs.frame_counts import count
+from vtfs.frame_inputs import FrameInputs
 from vtfs.gallery import GALLERY, build_scene
 from vtfs.parameters import PARAMETERS, TECHNIQUES, TUNED_TECHNIQUES, configuration
 from vtfs.scene import save_scene

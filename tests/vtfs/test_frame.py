@@ -15,8 +15,11 @@ from tests.strategies import (
     samples_in_slices,
     surface_samples,
 )
-from vtfs import frame
-from vtfs.frame import CapacityError, FrameInputs, Sizes, count, image_on_host, render, rounded_up, run_stages
+from vtfs import frame, frame_sizes
+from vtfs.frame import image_on_host, render, run_stages
+from vtfs.frame_counts import count
+from vtfs.frame_inputs import FrameInputs
+from vtfs.frame_sizes import CapacityError, Sizes, rounded_up
 from vtfs.parameters import configuration
 
 BATCH = 1024
@@ -48,7 +51,7 @@ def test_capacities_are_few_and_hold_what_is_needed():
 
 @pytest.mark.parametrize("name", ["cells", "blocks", "pairs"])
 def test_a_capacity_is_refused_only_where_none_holds_what_is_needed(name):
-    assert rounded_up(name, getattr(frame._LARGEST, name) // 2) >= getattr(frame._LARGEST, name) // 2
+    assert rounded_up(name, getattr(frame_sizes._LARGEST, name) // 2) >= getattr(frame_sizes._LARGEST, name) // 2
 
 
 @pytest.mark.parametrize("technique", LISTED)

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.strategies import a_camera, layered_samples, nearby_lights
 from tests.vtfs.test_view_samples import FRONT, SOLID, frame, square, stacked
 from vtfs.camera import Lens
-from vtfs.frame import FrameInputs
+from vtfs.frame_inputs import FrameInputs
 from vtfs.gallery import build_scene
 from vtfs.gbuffer_files import load_gbuffer, save_gbuffer
 from vtfs.input_error import InputError

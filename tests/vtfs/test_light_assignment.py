@@ -24,7 +24,8 @@ from tests.strategies import (
 )
 from vtfs.bounds import Aabb, Sphere
 from vtfs.clusters import Clusters
-from vtfs.frame import FrameInputs, run_stages
+from vtfs.frame import run_stages
+from vtfs.frame_inputs import FrameInputs
 from vtfs.input_error import InputError
 from vtfs.light_assignment.brute_force import assign_brute_force
 from vtfs.light_assignment.light_tree import assign_tree, light_tree, reduce_lights, sort_lights

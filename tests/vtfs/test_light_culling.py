@@ -24,7 +24,8 @@ from tests.strategies import (
 from tests.vtfs.test_light_assignment import listed_lights
 from vtfs.camera import Lens, Viewport
 from vtfs.false_positives import ListedPairs, listed_pairs
-from vtfs.frame import FrameInputs, run_stages
+from vtfs.frame import run_stages
+from vtfs.frame_inputs import FrameInputs
 from vtfs.lights import Lights, cone_cosines
 from vtfs.parameters import configuration
 from vtfs.view_samples import ViewSamples

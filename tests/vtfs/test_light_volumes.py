@@ -18,7 +18,9 @@ from tests.strategies import (
     through,
 )
 from vtfs.camera import Lens
-from vtfs.frame import FrameInputs, count, run_stages
+from vtfs.frame import run_stages
+from vtfs.frame_counts import count
+from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
 from vtfs.light_volumes import lights_of_samples
 from vtfs.parameters import configuration
@@ -61,7 +63,7 @@ def test_a_light_shades_the_pixels_of_its_volume(technique, oracle, seed):
     config, inputs = configuration(technique, {"batch": BATCH}), FrameInputs(samples, lights)
     env, _ = run_stages(config, inputs, until="assign")
     n_runs = env["positions"].n_visible_runs
-    found = from_runs(np.asarray(lights_of_samples(env["assign"], n_runs)), SMALL)
+    found = from_runs(lights_of_samples(env["assign"], n_runs), SMALL)
     # Exact but for what float32 rounds: 1e-5 of the light's distance and size.
     at_least, at_most = oracle(samples, lights, -1e-5).sum(-1), oracle(samples, lights, 1e-5).sum(-1)
     if technique == "deferred":  # a sample inside the sphere counts also where the ray just misses it

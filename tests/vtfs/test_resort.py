@@ -7,7 +7,9 @@ import pytest
 
 from tests.strategies import a_camera, nearby_lights, surface_samples
 from tests.vtfs.test_light_assignment import listed_lights
-from vtfs.frame import FrameInputs, count, run_stages
+from vtfs.frame import run_stages
+from vtfs.frame_counts import count
+from vtfs.frame_inputs import FrameInputs
 from vtfs.light_lists import view_lights
 from vtfs.parameters import configuration
 from vtfs.techniques import REGISTRY

@@ -9,7 +9,9 @@ import pytest
 from tests import oracles
 from tests.strategies import a_camera, layered_samples, nearby_lights, surface_samples
 from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
-from vtfs.frame import FrameInputs, count, image_on_host, render, run_stages
+from vtfs.frame import image_on_host, render, run_stages
+from vtfs.frame_counts import count
+from vtfs.frame_inputs import FrameInputs
 from vtfs.input_error import InputError
 from vtfs.light_shadows import CastMask, shadow_bits
 from vtfs.lights import Lights, point_lights

@@ -21,7 +21,8 @@ from tests.strategies import (
     through,
 )
 from vtfs.camera import Lens
-from vtfs.frame import FrameInputs, image_on_host, render, run_stages
+from vtfs.frame import image_on_host, render, run_stages
+from vtfs.frame_inputs import FrameInputs
 from vtfs.parameters import SHADOW_REFERENCES, TECHNIQUES, configuration
 from vtfs.reference import forward_reference, largest_relative_difference
 from vtfs.techniques import REGISTRY

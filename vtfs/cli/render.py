@@ -42,8 +42,8 @@ def render(
     setup = scene.set_up()
     from vtfs.cell_maps import cell_maps
     from vtfs.device import keep_compiled_programs
-    from vtfs.frame import count as count_frame
     from vtfs.frame import render as render_frame
+    from vtfs.frame_counts import count as count_frame
     from vtfs.image import exposure, heat_map, random_colours, tone_map, write_png
     from vtfs.shadow_maps import shadow_maps
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vtfs.frame import FrameInputs, run_stages
+from vtfs.frame import run_stages
+from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
