@@ -60,7 +60,7 @@ def test_what_does_not_fit_is_run_again_and_is_the_same(technique, monkeypatch):
     config = a_config(technique, tile_px=4)
     expected, roomy = run_stages(config, inputs)[0], count(config, inputs)[0].technique
     image = image_on_host(expected["shade_opaque"], inputs)
-    monkeypatch.setattr(frame, "_FIRST", Sizes(cells=32, blocks=64, pairs=256))
+    monkeypatch.setattr(frame_sizes, "_FIRST", Sizes(cells=32, blocks=64, pairs=256))
     env, sizes = run_stages(config, inputs)
     lists, same = env["assign"], expected["assign"]
     n_clusters, total = int(env["clusters"].n_clusters), int(lists.total)
