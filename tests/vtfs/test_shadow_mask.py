@@ -285,6 +285,19 @@ def test_what_blocks_most_of_the_light_is_known():
     np.testing.assert_allclose(found, np.pi / 2, rtol=1e-12)  # a few roundings of float64
 
 
+def test_the_only_child_of_a_full_trees_root_need_not_be_its_first():
+    camera = a_camera(SMALL, near_m=1e-7)  # all samples are in the deeper half of the slices
+    rng = np.random.default_rng(6)
+    samples, casters = surface_samples(camera, 6), soup(camera, rng, largest=1.0)
+    light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
+    columns, rows = -(-SMALL.width_px // 8), -(-SMALL.height_px // 8)
+    cells = n_cells(columns, rows, int(shadow_grid(samples, 8).depth_slices), 8)
+    found = cast("cluster_hierarchy", replace(CLUSTERS, tree="full", cells=cells), samples, casters, light, bias_m)
+    assert found.counts["node_tests_0"] == 0  # the root has one child
+    reference = assert_equal_outside_the_bands(found.shadowed, samples, casters, light, bias_m, 0.01)
+    assert 0.02 < reference.mean() < 0.98
+
+
 def test_the_full_tree_is_refused_where_it_is_too_large():
     assert n_cells(128, 100, 200, 8) == 2**22
     with pytest.raises(InputError, match=r"tree=full: 240 x 135 x 512 cells .* MiB, more than 256; use tree=compact"):

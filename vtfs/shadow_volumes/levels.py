@@ -152,7 +152,8 @@ def _split_level(
         planes = jax.tree.map(lambda c: c[:, None, :], volume.nodes.at(triangle))
         boxes = tuple(row[:, c, :, None] for c in range(6))
         refined, goes_on, accepted = test_nodes(planes, boxes, hierarchy.is_frustum, bias_m)
-        pass_on = jnp.zeros((1, b, 1), bool).at[:, 0].set(True) & (triangle != absent)[:, None, :]
+        # Wherever it is: in a full tree the only child need not be the first.
+        pass_on = ~jnp.isnan(boxes[0]) & (triangle != absent)[:, None, :]
         goes_on, accepted = jnp.where(only, pass_on, goes_on), accepted & ~only
         # Both answers in one word: two reductions would each repeat the tests.
         shift = jnp.arange(LANES, dtype=jnp.uint32)
