@@ -315,8 +315,11 @@ def _shade(
     clusters: Clusters,
     lists: LightLists,
     cluster_light: ClusterLight | None = None,
+    shadows: LightShadows | None = None,
 ) -> Image:
-    return shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, cluster_light=cluster_light)
+    return shade(
+        gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, cluster_light=cluster_light, shadows=shadows
+    )
 
 
 def _shade_transparent(
@@ -329,40 +332,15 @@ def _shade_transparent(
     clusters: Clusters,
     lists: LightLists,
     cluster_light: ClusterLight | None = None,
+    shadows: LightShadows | None = None,
 ) -> Image:
-    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, cluster_light=cluster_light)
+    rows, batch = lights.row, plan.batch
+    colour = shade(gbuffer, clusters, lists, rows, light_cutoff, batch, True, shadows, cluster_light)
     return blend_layers(solid, colour, layers)
 
 
 def _shadow_bits(plan: Plan, masks: list[CastMask], slots: ShadowSlots, layers: LayerTable) -> LightShadows:
     return shadow_bits(masks, slots, layers)
-
-
-def _shade_shadowed(
-    plan: Plan,
-    gbuffer: GBuffer,
-    lights: ViewLights,
-    light_cutoff,
-    clusters: Clusters,
-    lists: LightLists,
-    shadows: LightShadows,
-) -> Image:
-    return shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, shadows=shadows)
-
-
-def _shade_transparent_shadowed(
-    plan: Plan,
-    gbuffer: GBuffer,
-    layers: LayerTable,
-    lights: ViewLights,
-    light_cutoff,
-    solid: Image,
-    clusters: Clusters,
-    lists: LightLists,
-    shadows: LightShadows,
-) -> Image:
-    colour = shade(gbuffer, clusters, lists, lights.row, light_cutoff, plan.batch, True, shadows=shadows)
-    return blend_layers(solid, colour, layers)
 
 
 def _shade_forward(plan: Plan, gbuffer: GBuffer, lights: ViewLights, light_cutoff) -> Image:
@@ -443,13 +421,11 @@ def _deferred(name: str, stencil: bool) -> Technique:
 
 
 _SHADOW_BITS = Stage("shadow_bits", _shadow_bits, ("shadow_merge", "shadow_slots", "layers"))
+_SHADOWED = ("clusters", "assign", "cluster_light", "shadow_bits")
 _SHADE_SHADOWED = (
-    Stage("shade_opaque", _shade_shadowed, ("gbuffer", *_LIGHTS, "clusters", "assign", "shadow_bits"), ("batch",)),
+    Stage("shade_opaque", _shade, ("gbuffer", *_LIGHTS, *_SHADOWED), ("batch",)),
     Stage(
-        "shade_transparent",
-        _shade_transparent_shadowed,
-        ("gbuffer", "layers", *_LIGHTS, "shade_opaque", "clusters", "assign", "shadow_bits"),
-        ("batch",),
+        "shade_transparent", _shade_transparent, ("gbuffer", "layers", *_LIGHTS, "shade_opaque", *_SHADOWED), ("batch",)
     ),
 )
 
