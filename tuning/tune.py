@@ -24,7 +24,6 @@ from tuning.sweep import SearchResult, search
 from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_counts
 from vtfs.device import versions
 from vtfs.files import write_atomically
-from vtfs.frame_inputs import FrameInputs
 from vtfs.parameters import Configuration, casts_shadows, configuration
 from vtfs.scene_setup import SceneSetup
 
@@ -155,13 +154,9 @@ def choose_frames(setup: SceneSetup, config: Configuration = DEFAULT_CONFIGURATI
     ones."""
     work = {}
     for frame in setup.counted_frames:
-        counts = cached_counts(config, setup.key, frame, functools.partial(_inputs, setup, frame))
+        counts = cached_counts(config, setup.key, frame, functools.partial(setup.inputs, frame))
         work[frame] = main_work(counts.technique)
     return busiest_frames(work)
-
-
-def _inputs(setup: SceneSetup, frame: int) -> FrameInputs:
-    return setup.inputs(frame)
 
 
 def _config(measurement: Measurement) -> Configuration:
