@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,8 +21,11 @@ from vtfs.parameters import (
     TUNED_TECHNIQUES,
     casts_shadows,
     configuration,
-    default_value,
 )
+
+if TYPE_CHECKING:
+    from reports.recommendation import Recommendation
+    from reports.run_folder import Timed
 
 
 @with_scene
@@ -91,6 +94,8 @@ def tune(
     setup = scene.set_up()
     keep_compiled_programs()
     from reports.page import write_report
+    from reports.recommendation import recommend
+    from reports.run_folder import read_run_folder
     from tuning.tune import DEFAULT_BUDGET, TuneOptions, tune
 
     options = TuneOptions(
@@ -108,9 +113,10 @@ def tune(
         result = tune(setup, options, status.say, status.search)
         status.say("writing the report")
         page = write_report(out)
+        said = recommend(read_run_folder(out))
     write_json(json_file, result)
     if json_file != "-":
-        print(_recommendation(result))
+        print(_recommendation(result, said))
         print(f"Report: {page}")
 
 
@@ -135,19 +141,32 @@ def _command() -> str:
     return shlex.join(["vtfs", *sys.argv[1:]])
 
 
-def _recommendation(result: dict[str, Any]) -> str:
-    best, gain = result["best"], result["gain"]
-    technique, params = best["technique"], best["params"]
-    changed = [f"{name}={value}" for name, value in params.items() if value != default_value(technique, name)]
-    low, high = best["time_ms_interval"]
-    lines = [f"{' '.join([best['technique'], *changed])}: {best['time_ms']:.1f} ms a frame ({low:.1f} to {high:.1f})"]
-    for role, words in (("default", "its default"), ("fastest_default", "the fastest default")):
-        if f"over_{role}" in gain:
-            low, high = gain[f"over_{role}_interval"]
-            lines.append(f"  {gain[f'over_{role}']:.2f} times as fast as {words} ({low:.2f} to {high:.2f})")
+def _recommendation(result: dict[str, Any], said: Recommendation) -> str:
+    """What the report recommends, in a few lines: a default where what was found is not faster for certain."""
+    gain, chosen, fastest = result["gain"], said.chosen, said.fastest
+    if chosen is None or fastest is None:  # the search has refused that before
+        return str(result["claim"])
+    kept = said.verdict == "keep_default"
+    lines = [f"{'keep the default, ' if kept else ''}{_timed_text(chosen)}"]
+    if kept and fastest.is_configuration(chosen.technique, chosen.params):
+        lines.append("  nothing that was measured is faster")
+    else:
+        lines += [f"  fastest in the search: {_timed_text(fastest)}"] if kept else []
+        for role, words in (("default", "its default"), ("fastest_default", "the fastest default")):
+            if f"over_{role}" in gain:
+                low, high = gain[f"over_{role}_interval"]
+                turns = ", measured in turns" if kept else ""
+                lines.append(f"  {gain[f'over_{role}']:.2f} times as fast as {words} ({low:.2f} to {high:.2f}){turns}")
     lines.append(f"  {result['claim']}")
     lines.append(
         f"  {result['measured']} configurations measured (the space has {result['space_size']}), "
         f"{result['compiled_programs']} programs compiled, {result['wall_s']:.0f} s: {result['stop_reason']}"
     )
     return "\n".join(lines)
+
+
+def _timed_text(timed: Timed) -> str:
+    from reports.recommendation import setting_text
+
+    interval = f" ({timed.interval_ms[0]:.1f} to {timed.interval_ms[1]:.1f})" if timed.interval_ms else ""
+    return f"{setting_text(timed.technique, timed.params)}: {timed.time_ms:.1f} ms a frame{interval}"
