@@ -35,6 +35,7 @@ def answers(
     light: ShadowLight,
     bias_m: float,
     origin_m: np.ndarray,
+    casts: np.ndarray | None = None,
     n_padded: int = 0,
 ) -> np.ndarray:
     """`LIT`, `BY_ITSELF` or `SHADOWED`, uint8 `[n]`.
@@ -42,6 +43,7 @@ def answers(
     **Arguments:**
 
     - `points_m`: float64 `[n, 3]`, relative to `origin_m`, not turned; `own`: the caster that each lies on, -1: none.
+    - `casts`: which casters there are, bool `[T]`; all unless given.
     - `n_padded`: so many triangles are sent, so that scenes share a program.
     """
     if not casters.n_triangles:
@@ -57,7 +59,7 @@ def answers(
         left = np.maximum(distance - bias_m, 0) / np.maximum(distance, 1e-300)
         start = start * left
         way = -start
-    corner = _sent(casters, about, light, max(n_padded, casters.n_triangles))
+    corner = _sent(casters, about, light, casts, max(n_padded, casters.n_triangles))
     found = np.zeros(len(points_m), np.uint8)
     with jax.enable_x64(True):
         corner = jax.device_put(corner)
@@ -77,7 +79,7 @@ def answers(
     return found
 
 
-def _sent(casters: Casters, about_m: np.ndarray, light: ShadowLight, n: int) -> np.ndarray:
+def _sent(casters: Casters, about_m: np.ndarray, light: ShadowLight, casts: np.ndarray | None, n: int) -> np.ndarray:
     """Corners in chunks, `[chunks, 9, CHUNK]`; NaN, which no comparison holds for, where there is no inside."""
     corner = casters.vertices_m[casters.triangles] - about_m
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -87,8 +89,11 @@ def _sent(casters: Casters, about_m: np.ndarray, light: ShadowLight, n: int) -> 
     else:
         height = (normal * corner[:, 0]).sum(axis=1)
         size = np.linalg.norm(normal, axis=1) * np.linalg.norm(corner, axis=2).max(axis=1)
+    has_inside = np.abs(height) > LEAST_HEIGHT * size
+    if casts is not None:
+        has_inside &= casts
     rows = np.full((-(-n // CHUNK) * CHUNK, 9), np.nan)
-    rows[: len(corner)] = np.where((np.abs(height) > LEAST_HEIGHT * size)[:, None], corner.reshape(-1, 9), np.nan)
+    rows[: len(corner)] = np.where(has_inside[:, None], corner.reshape(-1, 9), np.nan)
     return np.ascontiguousarray(rows.reshape(-1, CHUNK, 9).transpose(0, 2, 1))
 
 

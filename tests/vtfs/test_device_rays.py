@@ -10,7 +10,7 @@ from tests.strategies import SMALL, a_camera, surface_samples
 from tests.vtfs.test_shadow_mask import balls, light_of, soup
 from vtfs.shadow_casters import Casters, ShadowLight
 from vtfs.shadow_mask import default_bias_m
-from vtfs.shadow_references import brute_force, kept_casters, view_points_m
+from vtfs.shadow_references import brute_force, facing_light, kept_casters, view_points_m
 
 
 @pytest.mark.parametrize("kind", ["at the eye", "near", "inside", "far", "directional"])
@@ -23,10 +23,10 @@ def test_rays_on_the_device_say_what_planes_in_numpy_say(kind, eye_m, made):
     bias_m, eye = default_bias_m(casters), np.array(camera.eye_m)
     points = view_points_m(samples, samples.valid)
     nobody = np.full(len(points), -1)
-    for front_faces in ("cast", "culled"):
-        kept = kept_casters(casters, light, front_faces)
+    culled = ~facing_light(casters, light)
+    for kept, casts in ((casters, None), (kept_casters(casters, light, "culled"), culled)):
         expected = brute_force(points, kept, light, bias_m, eye)
-        found = answers(points, nobody, kept, light, bias_m, eye, n_padded=512)
+        found = answers(points, nobody, casters, light, bias_m, eye, casts, n_padded=512)
         assert (found == np.where(expected, SHADOWED, LIT)).all()
     assert 0.02 < (found == SHADOWED).mean() < 0.98 or kind != "inside"
 
@@ -34,7 +34,7 @@ def test_rays_on_the_device_say_what_planes_in_numpy_say(kind, eye_m, made):
 def test_the_triangle_that_a_sample_lies_on_does_not_shadow_it():
     """Two triangles, one before the other; samples behind both, told to lie on one of them, on neither, or lit."""
     corner = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
-    casters = Casters(np.concatenate([corner, corner + [0, 0, 1]]), np.arange(6).reshape(2, 3))
+    casters = Casters(np.concatenate([corner, corner + np.array([0, 0, 1])]), np.arange(6).reshape(2, 3))
     light = ShadowLight((0.0, 0.0, 5.0))
     points = np.array([[0.0, 0, -1], [0, 0, -1], [0, 0, 0.5], [0, 0, 0.5], [9, 0, -1]])
     own = np.array([-1, 0, 1, 0, -1])
