@@ -1,10 +1,11 @@
 """Every shadow mask is right, sample by sample: a campaign over scenes, frames, lights and variants.
 
 python -m benchmarks.shadow_exactness SCENE[,SCENE...] --out DIR [--scenes FOLDER] [--variants pairwise]
-    [--size 1280x720] [--triangles N] [--frames 3] [--lights 3] [--workers 16] [--at-once 4] [--minutes 8] [--spheres]
+    [--size 1280x720] [--triangles N] [--frames 3] [--lights 3] [--workers 16] [--at-once 1] [--minutes 8] [--spheres]
 
 SCENE is a built-in name, or FOLDER/SCENE.glb with SCENE.cameras.json beside it. All samples that face the light are
-compared with float64 rays against all triangles (`benchmarks.device_rays`), and what differs is classified in NumPy.
+compared with float64 rays against all triangles (`benchmarks.device_rays`), and what differs is classified in NumPy
+(`is_excused`).
 `--variants every` is each value of each parameter and each pair of values. `--size`: that of the cameras unless given.
 
 Threads compile one variant each and take it through the scenes of its number of triangles, a frame at a time. Each line
@@ -31,7 +32,7 @@ import jax
 import numpy as np
 
 from benchmarks.closed_sphere import all_spheres
-from benchmarks.shadow_variants import Variant, one_at_a_time, pairwise, variant
+from benchmarks.shadow_variants import Variant, one_at_a_time, pairwise, unrolled, variant
 from benchmarks.shadow_views import LIGHTS, Subject, View
 from vtfs.camera import Viewport
 from vtfs.device import device_name, keep_compiled_programs, versions
@@ -60,11 +61,16 @@ class Walker:
     def mask(self, view: View) -> np.ndarray:
         """The mask of a view, bool `[h, w]`."""
         frame = view.shadow_frame(self.plan.tile_px, self.variant.depth_slices, self.variant.front_faces)
-        fits, masks = fitted_to_all(
-            self.variant.technique, self.plan, [frame], unrolled=False, run=lambda plan, _: self._run(plan, frame)
+        unrolled = self.variant.unrolled
+        fits, (mask,) = fitted_to_all(
+            self.variant.technique, self.plan, [frame], unrolled, run=lambda plan, _: self._run(plan, frame)
         )
-        self.plan = fits
-        return from_runs(np.asarray(masks[0].shadowed), view.samples.camera.viewport)
+        if unrolled:
+            mask = self._run(fits, frame)
+            assert not bool(mask.overflowed)
+        else:
+            self.plan = fits
+        return from_runs(np.asarray(mask.shadowed), view.samples.camera.viewport)
 
     def _run(self, plan: ShadowPlan, frame: ShadowFrame) -> ShadowMask:
         with jax.enable_x64(True):
@@ -120,7 +126,7 @@ class Campaign:
                 frame, order, walker = rounds.get_nowait()
             except queue.Empty:
                 return
-            if not self.one_round(frame, walker):
+            if not self.one_round(frame % self.n_frames, walker):
                 return
             if frame + 1 < self.n_frames:
                 rounds.put((frame + 1, order, walker))
@@ -128,7 +134,8 @@ class Campaign:
     def one_round(self, frame: int, walker: Walker) -> bool:
         """All lights and scenes of one frame; false where time is over."""
         subjects = [subject for subject in self.subjects if subject.n_padded == walker.n_padded]
-        for light, subject in itertools.product(LIGHTS[: self.n_lights], subjects):
+        n_lights = 1 if walker.variant.unrolled else self.n_lights
+        for light, subject in itertools.product(LIGHTS[:n_lights], subjects):
             if time.monotonic() > self.end:
                 return False
             key = (subject.name, frame, light, walker.variant.name)
@@ -150,22 +157,16 @@ class Campaign:
 
 def total(lines: list[dict]) -> dict[str, Any]:
     """Over all lines: what was compared, and the worst share of the bands of any line."""
-    judged = [line for line in lines if "failed" not in line]
+    judged = _judged(lines)
+    known = {_key(line) for line in judged}
     names = (
-        "samples",
-        "shadowed",
-        "by_itself",
-        "differs",
-        "differs_from_own",
-        "near_edge",
-        "near_plane",
-        "errors",
+        "samples", "shadowed", "by_itself", "differs", "own_plane", "near_edge", "near_plane", "errors",
         "not_classified",
-    )
+    )  # fmt: skip
     worst = max(judged, key=in_bands, default=None)
     return {
         "masks": len(judged),
-        "failed": len(lines) - len(judged),
+        "failed": len({_key(line) for line in lines} - known),
         "scenes": len({line["scene"] for line in judged}),
         "views": len({(line["scene"], line["frame"], line["light"]) for line in judged}),
         "variants": len({line["variant"] for line in judged}),
@@ -175,9 +176,35 @@ def total(lines: list[dict]) -> dict[str, Any]:
     }
 
 
+def _judged(lines: list[dict]) -> list[dict]:
+    return list({_key(line): line for line in lines if "failed" not in line}.values())
+
+
+def table(lines: list[dict]) -> str:
+    """A row a scene, in Markdown; samples are those of all masks together."""
+    head = ("scene", "triangles", "views", "masks", "samples, all masks", "in shadow", "differ", "near an edge")
+    head = (*head, "near a plane, their own", "most in bands", "errors")
+    rows = [_row(head), "| --- " * len(head) + "|"]
+    for scene in dict.fromkeys(line["scene"] for line in _judged(lines)):
+        own = [line for line in _judged(lines) if line["scene"] == scene]
+        found = total(own)
+        cells = (
+            scene, f"{own[0]['triangles']:,}", found["views"], found["masks"], f"{found['samples']:,}",
+            f"{found['shadowed'] / max(1, found['samples']):.0%}", f"{found['differs']:,}", f"{found['near_edge']:,}",
+            f"{found['near_plane']:,}, {found['own_plane']:,}", f"{found['most_in_bands']:.4%}",
+            found["errors"] + found["not_classified"],
+        )  # fmt: skip
+        rows.append(_row(cells))
+    return "\n".join(rows)
+
+
+def _row(cells: tuple) -> str:
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
 def in_bands(line: dict) -> float:
-    """The share of the samples of a line in either band."""
-    return (line["near_edge"] + line["near_plane"]) / max(1, line["samples"])
+    """The share of the samples of a line in the bands."""
+    return (line["near_edge"] + line["near_plane"] + line["own_plane"]) / max(1, line["samples"])
 
 
 def main() -> None:
@@ -191,7 +218,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=3)
     parser.add_argument("--lights", type=int, default=len(LIGHTS))
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--at-once", type=int, default=4)
+    parser.add_argument("--at-once", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=8.0)
     parser.add_argument("--spheres", action="store_true")
     given = parser.parse_args()
@@ -207,15 +234,17 @@ def main() -> None:
     subjects = [Subject(name, given.scenes, viewport, given.triangles) for name in given.scene.split(",")]
     choices = pairwise() + (one_at_a_time() if given.variants == "every" else [])
     at_once, rounds = threading.Semaphore(given.at_once), queue.PriorityQueue()
-    walkers = {
-        (found.name, n_padded): Walker(found, n_padded, at_once)
-        for choice in choices
-        for n_padded in sorted({subject.n_padded for subject in subjects})
-        for found in [variant(choice, n_padded)]
-    }
-    for order, walker in enumerate(walkers.values()):
-        rounds.put((0, order, walker))
-    print(f"{device_name()}: {len(walkers)} programs", flush=True)
+    sizes = sorted({subject.n_padded for subject in subjects})
+    looped = {(one.name, size): one for choice in choices for size in sizes for one in [variant(choice, size)]}
+    timed = [(size, one) for size in sizes for one in unrolled(size)]
+    for order, ((_, size), one) in enumerate(looped.items()):
+        rounds.put((0, order, Walker(one, size, at_once)))
+    for order, (size, one) in enumerate(timed):  # each view compiles: after all the others, on the first view
+        rounds.put((given.frames, order, Walker(one, size, at_once)))
+    n_views = given.frames * min(given.lights, len(LIGHTS))
+    n_masks = sum(subject.n_padded == size for _, size in looped for subject in subjects) * n_views
+    n_masks += 2 * len(subjects)
+    print(f"{device_name()}: {len(looped)} programs, {len(timed)} unrolled, {n_masks:,} masks", flush=True)
     about = {"device": device_name(), "jax": jax.__version__}
     results = Results(given.out / "shadow-exactness.jsonl")
     campaign = Campaign(subjects, given.frames, given.lights, results, end, about)
@@ -224,7 +253,8 @@ def main() -> None:
         thread.start()
     for thread in threads:
         thread.join(max(0.0, end - time.monotonic()) + 5)
-    print(json.dumps(total(list(results.lines)), indent=1), flush=True)
+    print(json.dumps({"planned": n_masks, **total(list(results.lines))}, indent=1), flush=True)
+    print(table(list(results.lines)), flush=True)
     os._exit(0)  # what still compiles is not waited for
 
 

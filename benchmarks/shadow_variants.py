@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from vtfs.shadow_casters import FrontFaces
@@ -36,12 +36,16 @@ FULL_TREE_SLICES = 32
 
 @dataclass(frozen=True)
 class Variant:
-    """A technique, its plan without capacities, and what casts."""
+    """A technique, its plan without capacities, and what casts.
+
+    - `unrolled`: the program that is timed on a GPU, without loops, with the capacities of one view.
+    """
 
     name: str
     technique: str
     plan: ShadowPlan
     front_faces: FrontFaces
+    unrolled: bool = False
 
     @property
     def depth_slices(self) -> int:
@@ -64,6 +68,13 @@ def variant(choice: dict[str, Any], n_triangles: int) -> Variant:
     )
     name = " ".join(f"{name}={_text(value)}" for name, value in choice.items() if name != "technique")
     return Variant(f"{choice['technique']} {name}", choice["technique"], plan, choice["front_faces"])
+
+
+def unrolled(n_triangles: int) -> list[Variant]:
+    """The defaults as they are timed."""
+    defaults = [{name: values[0] for name, values in VALUES.items()} | {"technique": t} for t in VALUES["technique"]]
+    found = [variant(choice, n_triangles) for choice in defaults]
+    return [replace(one, name=f"unrolled {one.name}", unrolled=True) for one in found]
 
 
 def _text(value: Any) -> str:

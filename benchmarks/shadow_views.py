@@ -5,7 +5,6 @@ Triangles are padded to few counts, and all views have one size, so that scenes 
 
 from __future__ import annotations
 
-import itertools
 import threading
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.device_rays import BY_ITSELF, LIT, SHADOWED, answers
+from benchmarks.device_rays import BY_ITSELF, SHADOWED, answers
 from vtfs.camera import CameraPath, Viewport, load_cameras
 from vtfs.gallery import GALLERY, build_scene
 from vtfs.input_error import InputError
@@ -30,7 +29,7 @@ from vtfs.shadow_mask import (
     facing_samples,
     shadow_frame,
 )
-from vtfs.shadow_references import classify, facing_light, kept_casters, view_points_m
+from vtfs.shadow_references import facing_light, is_excused, kept_casters, view_points_m
 from vtfs.shadow_techniques import shadow_grid
 from vtfs.tracer import Tracer
 from vtfs.view_samples import ViewSamples, trace_view_samples
@@ -170,44 +169,46 @@ class View:
 
         return self.made.get(("reference", front_faces), ask)
 
-    def _kept(self, front_faces: FrontFaces) -> Casters:
-        return self.made.get(("kept", front_faces), lambda: kept_casters(self.subject.casters, self.light, front_faces))
-
     def judged(self, mask: np.ndarray, front_faces: FrontFaces) -> dict[str, int]:
         """Where a mask of the image differs from the reference, by reason.
 
-        `by_itself`: samples that only their own triangle meets, which the reference leaves lit. The techniques know no
-        own triangle: where a mask has them in shadow they are counted among the differences too;
-        `differs_from_own` are those from a reference in which own triangles cast.
+        - `by_itself`: samples that only their own triangle meets, which the reference leaves lit. The techniques know
+          no own triangle: those of them that a mask has in shadow differ by their `own_plane`.
+        - `near_edge`, `near_plane`: what else differs, where a sample that is moved within the band has the answer
+          (`is_excused`: that some edge or plane is near excuses nothing, as every sample lies on a plane).
+        - `errors`: neither; also what receives nothing and yet is in shadow.
         """
-        reference = self.reference(front_faces)
-        differs = np.flatnonzero(mask[self.receives] != (reference == SHADOWED))
-        reasons = [self._reason(int(index), front_faces) for index in differs[:MOST_CLASSIFIED]]
+        reference, found = self.reference(front_faces), mask[self.receives]
+        differs = np.flatnonzero(found != (reference == SHADOWED))
+        own = (reference[differs] == BY_ITSELF) & found[differs]
+        asked = differs[~own]
+        reasons = self._reasons(asked[:MOST_CLASSIFIED], found, front_faces)
         return {
             "samples": len(reference),
             "shadowed": int((reference == SHADOWED).sum()),
             "by_itself": int((reference == BY_ITSELF).sum()),
             "differs": len(differs),
-            "differs_from_own": int((mask[self.receives] != (reference != LIT)).sum()),
+            "own_plane": int(own.sum()),
             "near_edge": reasons.count("edge"),
             "near_plane": reasons.count("plane"),
             "errors": reasons.count("error") + int(mask[~self.receives].sum()),
-            "not_classified": len(differs) - len(reasons),
+            "not_classified": len(asked) - len(reasons),
         }
 
-    def _reason(self, index: int, front_faces: FrontFaces) -> str:
-        def ask() -> str:
-            kept, one = self._kept(front_faces), np.ones(1, bool)
-            found = classify(self.points_m[index : index + 1], one, kept, self.light, self.bias_m, self.eye_m)
-            return "edge" if found.near_edge else "plane" if found.near_plane else "error"
-
-        return self.made.get(("reason", front_faces, index), ask)
-
-
-def cases(subjects: list[Subject], n_frames: int, n_lights: int) -> list[tuple[int, Subject, str]]:
-    """Frame, scene and light; every scene comes with each light once before any comes with another frame."""
-    return [
-        (frame, subject, light)
-        for frame, light in itertools.product(range(n_frames), LIGHTS[:n_lights])
-        for subject in subjects
-    ]
+    def _reasons(self, indices: np.ndarray, found: np.ndarray, front_faces: FrontFaces) -> list[str]:
+        """Of each sample that differs; a reference has two answers, so that a sample's reason does not depend on who
+        asks."""
+        known: dict[int, str] = self.made.get(("reasons", front_faces), dict)
+        new = np.array([index for index in indices.tolist() if index not in known], int)
+        if len(new):
+            casters, own = self.subject.casters, self.own[new]
+            if front_faces == "culled":
+                casts = ~facing_light(casters, self.light)
+                own = np.where((own >= 0) & casts[own], np.cumsum(casts)[own] - 1, -1)
+                casters = kept_casters(casters, self.light, front_faces)
+            by_edge, by_plane = is_excused(
+                self.points_m[new], found[new], casters, self.light, self.bias_m, own, self.eye_m
+            )
+            for index, is_edge, is_plane in zip(new.tolist(), by_edge, by_plane, strict=True):
+                known[index] = "edge" if is_edge else "plane" if is_plane else "error"
+        return [known[index] for index in indices.tolist()]
