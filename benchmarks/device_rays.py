@@ -36,7 +36,6 @@ def answers(
     bias_m: float,
     origin_m: np.ndarray,
     casts: np.ndarray | None = None,
-    n_padded: int = 0,
 ) -> np.ndarray:
     """`LIT`, `BY_ITSELF` or `SHADOWED`, uint8 `[n]`.
 
@@ -44,7 +43,6 @@ def answers(
 
     - `points_m`: float64 `[n, 3]`, relative to `origin_m`, not turned; `own`: the caster that each lies on, -1: none.
     - `casts`: which casters there are, bool `[T]`; all unless given.
-    - `n_padded`: so many triangles are sent, so that scenes share a program.
     """
     if not casters.n_triangles:
         return np.zeros(len(points_m), np.uint8)
@@ -59,7 +57,7 @@ def answers(
         left = np.maximum(distance - bias_m, 0) / np.maximum(distance, 1e-300)
         start = start * left
         way = -start
-    corner = _sent(casters, about, light, casts, max(n_padded, casters.n_triangles))
+    corner = _sent(casters, about, light, casts)
     found = np.zeros(len(points_m), np.uint8)
     with jax.enable_x64(True):
         corner = jax.device_put(corner)
@@ -92,7 +90,7 @@ def _sent(casters: Casters, about_m: np.ndarray, light: ShadowLight, casts: np.n
     has_inside = np.abs(height) > LEAST_HEIGHT * size
     if casts is not None:
         has_inside &= casts
-    rows = np.full((-(-n // CHUNK) * CHUNK, 9), np.nan)
+    rows = np.full((-(-len(corner) // CHUNK) * CHUNK, 9), np.nan)
     rows[: len(corner)] = np.where(has_inside[:, None], corner.reshape(-1, 9), np.nan)
     return np.ascontiguousarray(rows.reshape(-1, CHUNK, 9).transpose(0, 2, 1))
 

@@ -24,7 +24,7 @@ import queue
 import threading
 import time
 import traceback
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,9 @@ from vtfs.files import write_atomically
 from vtfs.gbuffer import from_runs
 from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
 from vtfs.shadow_techniques import counting_program, fitted_to_all, shadow_sizes
+
+FIRST_GROUPS, FIRST_LEAF_GROUPS, FIRST_PAIRS = 2**19, 2**22, 2**21
+"""Capacities that hold all but the largest views at 1280x720."""
 
 log = logging.getLogger("benchmarks.shadow_exactness")
 
@@ -57,6 +60,10 @@ class Walker:
 
     def __post_init__(self) -> None:
         self.plan = self.variant.plan
+        if jax.default_backend() != "cpu":  # memory is at hand there, and each step up compiles
+            n_pairs = FIRST_PAIRS if self.plan.passes == 2 else 0
+            groups = max(FIRST_GROUPS, 2 * self.n_padded)
+            self.plan = replace(self.plan, groups=groups, leaf_groups=FIRST_LEAF_GROUPS, pairs=n_pairs)
 
     def mask(self, view: View) -> np.ndarray:
         """The mask of a view, bool `[h, w]`."""

@@ -163,9 +163,9 @@ class View:
         """`benchmarks.device_rays.answers` of all samples that receive."""
 
         def ask() -> np.ndarray:
-            casters, n_padded = self.subject.casters, self.subject.n_padded
+            casters = self.subject.casters
             casts = ~facing_light(casters, self.light) if front_faces == "culled" else None
-            return answers(self.points_m, self.own, casters, self.light, self.bias_m, self.eye_m, casts, n_padded)
+            return answers(self.points_m, self.own, casters, self.light, self.bias_m, self.eye_m, casts)
 
         return self.made.get(("reference", front_faces), ask)
 

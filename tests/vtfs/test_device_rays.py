@@ -26,7 +26,7 @@ def test_rays_on_the_device_say_what_planes_in_numpy_say(kind, eye_m, made):
     culled = ~facing_light(casters, light)
     for kept, casts in ((casters, None), (kept_casters(casters, light, "culled"), culled)):
         expected = brute_force(points, kept, light, bias_m, eye)
-        found = answers(points, nobody, casters, light, bias_m, eye, casts, n_padded=512)
+        found = answers(points, nobody, casters, light, bias_m, eye, casts)
         assert (found == np.where(expected, SHADOWED, LIT)).all()
     assert 0.02 < (found == SHADOWED).mean() < 0.98 or kind != "inside"
 
