@@ -77,7 +77,7 @@ def answers(
     return found
 
 
-def _sent(casters: Casters, about_m: np.ndarray, light: ShadowLight, casts: np.ndarray | None, n: int) -> np.ndarray:
+def _sent(casters: Casters, about_m: np.ndarray, light: ShadowLight, casts: np.ndarray | None) -> np.ndarray:
     """Corners in chunks, `[chunks, 9, CHUNK]`; NaN, which no comparison holds for, where there is no inside."""
     corner = casters.vertices_m[casters.triangles] - about_m
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
