@@ -1,134 +1,268 @@
-"""Every shadow mask is the same, and right: a pairwise set of variants on views and lights of scenes.
+"""Every shadow mask is right, sample by sample: a campaign over scenes, frames, lights and variants.
 
-python -m benchmarks.shadow_exactness --out DIR SCENE[,SCENE...] [--triangles 20000] [--size 512] [--frames 3]
-    [--lights 3] [--workers 1] [--minutes 10]
+python -m benchmarks.shadow_exactness SCENE[,SCENE...] --out DIR [--scenes FOLDER] [--variants pairwise]
+    [--size 1280x720] [--triangles N] [--frames 3] [--lights 3] [--workers 16] [--at-once 1] [--minutes 8] [--spheres]
 
-SCENE is a built-in name or a GLB file with NAME.cameras.json beside it. The variants hold every pair of values of the
-parameters once or more. A view's masks are compared with one another; where they differ, where they differ from
-Embree, and at 500 samples drawn at random, each with float64 brute force.
+SCENE is a built-in name, or FOLDER/SCENE.glb with SCENE.cameras.json beside it. All samples that face the light are
+compared with float64 rays against all triangles (`benchmarks.device_rays`), and what differs is classified in NumPy
+(`is_excused`).
+`--variants every` is each value of each parameter and each pair of values. `--size`: that of the cameras unless given.
+
+Threads compile one variant each and take it through the scenes of its number of triangles, a frame at a time. Each line
+of DIR/shadow-exactness.jsonl is a variant on one view, written as it is known; a run goes on from what is there.
+`--spheres` first tests closed spheres (`benchmarks.closed_sphere`).
 """
 
 from __future__ import annotations
 
 import argparse
-import functools
 import itertools
 import json
+import logging
+import os
+import queue
+import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+import traceback
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+import jax
 import numpy as np
 
-from benchmarks.shadow_cases import Case, read_case
-from vtfs.device import device_name, keep_compiled_programs
+from benchmarks.closed_sphere import all_spheres
+from benchmarks.shadow_variants import Variant, one_at_a_time, pairwise, unrolled, variant
+from benchmarks.shadow_views import LIGHTS, Subject, View
+from vtfs.camera import Viewport
+from vtfs.device import device_name, keep_compiled_programs, versions
 from vtfs.files import write_atomically
 from vtfs.gbuffer import from_runs
-from vtfs.shadow_casters import ShadowLight
-from vtfs.shadow_mask import CastersOnDevice, ShadowPlan, casters_on_device, facing_samples, shadow_frame
-from vtfs.shadow_references import ShadowRays, brute_force, classify, view_points_m
-from vtfs.shadow_techniques import fitted, run_program, shadow_grid
+from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
+from vtfs.shadow_techniques import counting_program, fitted_to_all, shadow_sizes
 
-N_CHECKED, N_CLASSIFIED = 500, 400
-LIGHTS = ((0.45, 0.8, 0.55), (0.2, 0.5, 0.3), (0.7, 0.95, 0.6))
-VALUES = {
-    "technique": ("cluster_hierarchy", "ptsv"),
-    "tile_px": (8, 4, 16),
-    "branching": (8, 32, 4),
-    "bounds": ("explicit", "implicit"),
-    "extra": ("vertex", "off", "silhouette"),
-    "feedback": (True, False),
-    "batch": (0, 2**14),
-    "passes": (1, 2),
-    "tree": ("compact", "full"),
-}
+FIRST_GROUPS, FIRST_LEAF_GROUPS, FIRST_PAIRS = 2**19, 2**22, 2**21
+"""Capacities that hold all but the largest views at 1280x720."""
+
+log = logging.getLogger("benchmarks.shadow_exactness")
 
 
-def pairwise() -> list[dict]:
-    """Choices that hold every pair of values: each takes the most pairs that none before holds."""
-    names = list(VALUES)
-    pairs = {
-        ((a, x), (b, y)) for a, b in itertools.combinations(names, 2) for x in VALUES[a] for y in VALUES[b]
-    }  # fmt: skip
-    every = [dict(zip(names, values, strict=True)) for values in itertools.product(*VALUES.values())]
-    chosen = []
-    while pairs:
-        held = [[pair for pair in itertools.combinations(choice.items(), 2) if pair in pairs] for choice in every]
-        best = max(range(len(every)), key=lambda k: len(held[k]))
-        chosen.append(every[best])
-        pairs -= set(held[best])
-    return chosen
+@dataclass
+class Walker:
+    """One variant for one number of triangles: its program, with capacities that grow where a view needs more."""
+
+    variant: Variant
+    n_padded: int
+    at_once: threading.Semaphore
+    plan: ShadowPlan = field(init=False)
+    compiled: dict[ShadowPlan, Any] = field(default_factory=dict)
+    compile_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.plan = self.variant.plan
+        if jax.default_backend() != "cpu":  # memory is at hand there, and each step up compiles
+            n_pairs = FIRST_PAIRS if self.plan.passes == 2 else 0
+            groups = max(FIRST_GROUPS, 2 * self.n_padded)
+            self.plan = replace(self.plan, groups=groups, leaf_groups=FIRST_LEAF_GROUPS, pairs=n_pairs)
+
+    def mask(self, view: View) -> np.ndarray:
+        """The mask of a view, bool `[h, w]`."""
+        frame = view.shadow_frame(self.plan.tile_px, self.variant.depth_slices, self.variant.front_faces)
+        unrolled = self.variant.unrolled
+        fits, (mask,) = fitted_to_all(
+            self.variant.technique, self.plan, [frame], unrolled, run=lambda plan, _: self._run(plan, frame)
+        )
+        if unrolled:
+            mask = self._run(fits, frame)
+            assert not bool(mask.overflowed)
+        else:
+            self.plan = fits
+        return from_runs(np.asarray(mask.shadowed), view.samples.camera.viewport)
+
+    def _run(self, plan: ShadowPlan, frame: ShadowFrame) -> ShadowMask:
+        with jax.enable_x64(True):
+            if plan not in self.compiled:
+                started = time.monotonic()
+                self.compiled[plan] = counting_program(self.variant.technique, plan).lower(frame).compile()
+                self.compile_s += time.monotonic() - started
+            with self.at_once:
+                return jax.block_until_ready(self.compiled[plan](frame))
 
 
-def mask_of(choice: dict, case: Case, casters: CastersOnDevice) -> np.ndarray:
-    """The mask of the samples that face the light."""
-    plan = ShadowPlan(**{name: value for name, value in choice.items() if name != "technique"})
-    grid = shadow_grid(case.samples, plan.tile_px)
-    frame = shadow_frame(case.samples, casters, case.light, grid, case.bias_m, case.receives)
-    plan = fitted(choice["technique"], plan, frame, unrolled=False)
-    mask = run_program(choice["technique"], plan, frame)
-    return from_runs(np.asarray(mask.shadowed), case.samples.camera.viewport)[case.receives]
+class Results:
+    """Lines of a file; those of an earlier run are kept."""
+
+    def __init__(self, path: Path):
+        self._path, self._lock = path, threading.Lock()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        text = path.read_text() if path.exists() else ""
+        # A run that was killed may have left half a line.
+        self.lines = [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
+        write_atomically(path, "".join(json.dumps(line) + "\n" for line in self.lines).encode())
+
+    def has(self, *key: object) -> bool:
+        with self._lock:
+            return any(_key(line) == key for line in self.lines if "failed" not in line)
+
+    def add(self, line: dict) -> None:
+        with self._lock, self._path.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+            self.lines.append(line)
+        print(" ".join(f"{name}={value}" for name, value in line.items() if name not in ("device", "jax")), flush=True)
 
 
-def judged(case: Case, masks: list[np.ndarray]) -> dict[str, int]:
-    """Samples of a view, and where the masks are not what brute force says."""
-    points, eye = view_points_m(case.samples, case.receives), np.array(case.samples.camera.eye_m)
-    by_rays = ShadowRays(case.casters).shadowed(points, case.light, case.bias_m, eye)
-    unlike = np.any([mask != masks[0] for mask in masks], axis=0)
-    asked = np.flatnonzero(unlike | (masks[0] != by_rays))[:N_CLASSIFIED]
-    drawn = np.random.default_rng(0).choice(len(points), min(N_CHECKED, len(points)), replace=False)
-    asked = np.union1d(asked, drawn)
-    reference = brute_force(points[asked], case.casters, case.light, case.bias_m, eye)
-    differs = np.any([mask[asked] != reference for mask in masks], axis=0)
-    found = classify(points[asked], differs, case.casters, case.light, case.bias_m, eye)
+def _key(line: dict) -> tuple:
+    return line["scene"], line["frame"], line["light"], line["variant"]
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """What all threads share."""
+
+    subjects: list[Subject]
+    n_frames: int
+    n_lights: int
+    results: Results
+    end: float
+    about: dict[str, str]
+
+    def work(self, rounds: queue.PriorityQueue) -> None:
+        """Take walkers through their scenes, a frame at a time, until nothing or no time is left."""
+        while True:
+            try:
+                frame, order, walker = rounds.get_nowait()
+            except queue.Empty:
+                return
+            if not self.one_round(frame % self.n_frames, walker):
+                return
+            if frame + 1 < self.n_frames:
+                rounds.put((frame + 1, order, walker))
+
+    def one_round(self, frame: int, walker: Walker) -> bool:
+        """All lights and scenes of one frame; false where time is over."""
+        subjects = [subject for subject in self.subjects if subject.n_padded == walker.n_padded]
+        n_lights = 1 if walker.variant.unrolled else self.n_lights
+        for light, subject in itertools.product(LIGHTS[:n_lights], subjects):
+            if time.monotonic() > self.end:
+                return False
+            key = (subject.name, frame, light, walker.variant.name)
+            if self.results.has(*key):
+                continue
+            line = dict(zip(("scene", "frame", "light", "variant"), key, strict=True)) | self.about
+            try:
+                view = subject.view(frame, self.n_frames, light)
+                judged = view.judged(walker.mask(view), walker.variant.front_faces)
+                height, width = view.receives.shape
+                line |= {"size": f"{width}x{height}", "triangles": subject.casters.n_triangles} | judged
+                line |= {"compile_s": round(walker.compile_s, 1), "capacities": shadow_sizes(walker.plan)}
+            except Exception as error:  # one that fails is a line too, and the others go on
+                log.debug("%s", traceback.format_exc())
+                line |= {"failed": f"{type(error).__name__}: {error}"[:300]}
+            self.results.add(line)
+        return True
+
+
+def total(lines: list[dict]) -> dict[str, Any]:
+    """Over all lines: what was compared, and the worst share of the bands of any line."""
+    judged = _judged(lines)
+    known = {_key(line) for line in judged}
+    names = (
+        "samples", "shadowed", "by_itself", "differs", "own_plane", "near_edge", "near_plane", "errors",
+        "not_classified",
+    )  # fmt: skip
+    worst = max(judged, key=in_bands, default=None)
     return {
-        "samples": len(points),
-        "shadowed": int(masks[0].sum()),
-        "unlike_one_another": int(unlike.sum()),
-        "unlike_embree": int((masks[0] != by_rays).sum()),
-        "checked": len(asked),
-        "near_edge": found.near_edge,
-        "near_plane": found.near_plane,
-        "errors": found.errors,
+        "masks": len(judged),
+        "failed": len({_key(line) for line in lines} - known),
+        "scenes": len({line["scene"] for line in judged}),
+        "views": len({(line["scene"], line["frame"], line["light"]) for line in judged}),
+        "variants": len({line["variant"] for line in judged}),
+        **{name: sum(line[name] for line in judged) for name in names},
+        "most_in_bands": in_bands(worst) if worst else 0.0,
+        "most_in_bands_at": _key(worst) if worst else None,
     }
+
+
+def _judged(lines: list[dict]) -> list[dict]:
+    return list({_key(line): line for line in lines if "failed" not in line}.values())
+
+
+def table(lines: list[dict]) -> str:
+    """A row a scene, in Markdown; samples are those of all masks together."""
+    head = ("scene", "triangles", "views", "masks", "samples, all masks", "in shadow", "differ", "near an edge")
+    head = (*head, "near a plane, their own", "most in bands", "errors")
+    rows = [_row(head), "| --- " * len(head) + "|"]
+    for scene in dict.fromkeys(line["scene"] for line in _judged(lines)):
+        own = [line for line in _judged(lines) if line["scene"] == scene]
+        found = total(own)
+        cells = (
+            scene, f"{own[0]['triangles']:,}", found["views"], found["masks"], f"{found['samples']:,}",
+            f"{found['shadowed'] / max(1, found['samples']):.0%}", f"{found['differs']:,}", f"{found['near_edge']:,}",
+            f"{found['near_plane']:,}, {found['own_plane']:,}", f"{found['most_in_bands']:.4%}",
+            found["errors"] + found["not_classified"],
+        )  # fmt: skip
+        rows.append(_row(cells))
+    return "\n".join(rows)
+
+
+def _row(cells: tuple) -> str:
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def in_bands(line: dict) -> float:
+    """The share of the samples of a line in the bands."""
+    return (line["near_edge"] + line["near_plane"] + line["own_plane"]) / max(1, line["samples"])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes")
+    parser.add_argument("scene")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--triangles", type=int, default=20_000)
-    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--scenes", type=Path)
+    parser.add_argument("--variants", choices=("pairwise", "every"), default="pairwise")
+    parser.add_argument("--size")
+    parser.add_argument("--triangles", type=int)
     parser.add_argument("--frames", type=int, default=3)
     parser.add_argument("--lights", type=int, default=len(LIGHTS))
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--at-once", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=8.0)
+    parser.add_argument("--spheres", action="store_true")
     given = parser.parse_args()
     end = time.monotonic() + 60 * given.minutes
     keep_compiled_programs()
-    choices = pairwise()
-    print(f"{device_name()}: {len(choices)} variants", flush=True)
-    views: list[dict] = []
-    for scene in given.scenes.split(","):
-        path = Path(scene)
-        cameras = str(path.with_suffix(".cameras.json")) if path.suffix else None
-        uploaded: CastersOnDevice | None = None
-        for k, light in itertools.product(range(given.frames), LIGHTS[: given.lights]):
-            if time.monotonic() > end:
-                print(f"{path.stem}: no time left", flush=True)
-                break
-            case = read_case(scene, cameras, given.triangles, k / given.frames, given.size)
-            low, high = case.casters.vertices_m.min(axis=0), case.casters.vertices_m.max(axis=0)
-            placed = ShadowLight(tuple(low + (high - low) * np.array(light)))
-            case = replace(case, light=placed, receives=facing_samples(case.samples, placed))
-            casters = uploaded = uploaded or casters_on_device(case.casters)
-            with ThreadPoolExecutor(given.workers) as pool:
-                masks = list(pool.map(functools.partial(mask_of, case=case, casters=casters), choices))
-            view = {"scene": case.name, "frame": k, "light": light, "variants": len(masks), **judged(case, masks)}
-            views.append(view)
-            print(" ".join(f"{name}={value}" for name, value in view.items()), flush=True)
-            write_atomically(given.out / "shadow-exactness.json", json.dumps(views, indent=1).encode())
+    if given.spheres:
+        spheres = all_spheres()
+        about = {"device": device_name(), "versions": versions(), "spheres": spheres}
+        write_atomically(given.out / "closed-spheres.json", json.dumps(about, indent=1).encode())
+        for line in spheres:
+            print(" ".join(f"{name}={value}" for name, value in line.items()), flush=True)
+    viewport = Viewport(*map(int, given.size.split("x"))) if given.size else None
+    subjects = [Subject(name, given.scenes, viewport, given.triangles) for name in given.scene.split(",")]
+    choices = pairwise() + (one_at_a_time() if given.variants == "every" else [])
+    at_once, rounds = threading.Semaphore(given.at_once), queue.PriorityQueue()
+    sizes = sorted({subject.n_padded for subject in subjects})
+    looped = {(one.name, size): one for choice in choices for size in sizes for one in [variant(choice, size)]}
+    timed = [(size, one) for size in sizes for one in unrolled(size)]
+    for order, ((_, size), one) in enumerate(looped.items()):
+        rounds.put((0, order, Walker(one, size, at_once)))
+    for order, (size, one) in enumerate(timed):  # each view compiles: after all the others, on the first view
+        rounds.put((given.frames, order, Walker(one, size, at_once)))
+    n_views = given.frames * min(given.lights, len(LIGHTS))
+    n_masks = sum(subject.n_padded == size for _, size in looped for subject in subjects) * n_views
+    n_masks += 2 * len(subjects)
+    print(f"{device_name()}: {len(looped)} programs, {len(timed)} unrolled, {n_masks:,} masks", flush=True)
+    about = {"device": device_name(), "jax": jax.__version__}
+    results = Results(given.out / "shadow-exactness.jsonl")
+    campaign = Campaign(subjects, given.frames, given.lights, results, end, about)
+    threads = [threading.Thread(target=campaign.work, args=(rounds,), daemon=True) for _ in range(given.workers)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(max(0.0, end - time.monotonic()) + 5)
+    print(json.dumps({"planned": n_masks, **total(list(results.lines))}, indent=1), flush=True)
+    print(table(list(results.lines)), flush=True)
+    os._exit(0)  # what still compiles is not waited for
 
 
 if __name__ == "__main__":

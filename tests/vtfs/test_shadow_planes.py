@@ -6,80 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import trimesh
 
-from vtfs.shadow_volumes.planes import edge_planes, inside
-
-N_SAMPLES = 20_000
+from benchmarks.closed_sphere import KINDS, PLACES, covers, leaks_and_doubles
 
 
-def sphere() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, triangles and edges of 320 triangles."""
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
-    return np.array(ball.vertices), np.array(ball.faces, np.int32), np.array(ball.edges_unique)
-
-
-def samples_beyond(kind: str, vertices: np.ndarray, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Points outside, on lines from the light through vertices, edges or interiors; float32 relative to the light."""
-    _, triangles, edges = sphere()
-    if kind == "vertices":
-        target = vertices[rng.integers(0, len(vertices), N_SAMPLES)]
-    elif kind == "edges":
-        edge = vertices[edges[rng.integers(0, len(edges), N_SAMPLES)]]
-        t = rng.integers(1, 16, (N_SAMPLES, 1)) / 16
-        target = edge[:, 0] * (1 - t) + edge[:, 1] * t
-    else:
-        weight = rng.dirichlet([1, 1, 1], N_SAMPLES)[:, :, None]
-        target = (vertices[triangles[rng.integers(0, len(triangles), N_SAMPLES)]] * weight).sum(axis=1)
-    return ((target - light) * 2.0 ** rng.integers(1, 4, (N_SAMPLES, 1))).astype(np.float32)
-
-
-def covers(vertex_m, triangles, sample_m, fault):
-    """In how many volumes each sample lies, by the test of the algorithms, or by a faulty one."""
-    planes, inward = edge_planes(vertex_m, triangles, vertex_m, False, jnp.float64(0), jnp.bool_(False))
-    if fault == "float32":
-        planes = jax.tree.map(lambda c: c.astype(jnp.float32) if c.dtype == jnp.float64 else c, planes)
-        sample_m = tuple(c.astype(jnp.float32) for c in sample_m)
-    elif fault == "sign":
-        x, y, z = planes.normal[0]
-        planes = type(planes)(((-x, -y, -z), *planes.normal[1:]), (), planes.least, (), planes.behind)
-    elif fault == "no ties":
-        planes = type(planes)(planes.normal, (), tuple(0 * c - 1e-300 for c in planes.least), (), planes.behind)
-
-    def one(total, k):
-        plane = jax.tree.map(lambda c: c[k], planes)
-        return total + inside(plane, sample_m, jnp.float64(0)).astype(jnp.int32), None
-
-    total, _ = jax.lax.scan(one, jnp.zeros(sample_m[0].shape, jnp.int32), jnp.arange(triangles.shape[0]))
-    return total, inward != 0
-
-
-covers_jit = jax.jit(covers, static_argnums=3)
-
-
-def leaks_and_doubles(
-    kind: str, offset: float, scale: float, directional: bool = False, fault: str = ""
-) -> tuple[int, int]:
-    rng = np.random.default_rng(0)
-    unit, triangles, _ = sphere()
-    vertices = (unit * scale + offset).astype(np.float32).astype(np.float64)
-    light = vertices.mean(axis=0) + rng.uniform(-0.3, 0.3, 3) * scale
-    sample = samples_beyond(kind, vertices, light, rng)
-    with jax.enable_x64(True):
-        vertex = tuple(jnp.asarray((vertices - light)[:, c]) for c in range(3))
-        total, safe = covers_jit(
-            vertex, triangles, tuple(jnp.asarray(sample[:, c], jnp.float64) for c in range(3)), fault
-        )
-        total = np.asarray(total)
-        assert bool(safe.all())
-    return int((total == 0).sum()), int((total > 1).sum())
-
-
-@pytest.mark.parametrize("kind", ["vertices", "edges", "interiors"])
-@pytest.mark.parametrize(
-    ("offset", "scale"),
-    [(0.0, 1.0), (1e1, 1.0), (1e3, 1.0), (1e5, 1.0), (1e6, 1.0), (0.0, 1e3), (0.0, 1e6), (0.0, 1e-3)],
-)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("offset", "scale"), PLACES)
 def test_each_sample_beyond_a_closed_sphere_lies_in_exactly_one_volume(kind, offset, scale):
     assert leaks_and_doubles(kind, offset, scale) == (0, 0)
 
@@ -100,7 +32,7 @@ def cube_covers(fault: str) -> np.ndarray:
     points = points[np.abs(points).max(axis=1) > 1]
     with jax.enable_x64(True):
         vertex, point = (tuple(jnp.asarray(values[:, c]) for c in range(3)) for values in (corners, points))
-        return np.asarray(covers_jit(vertex, triangles, point, fault)[0])
+        return np.asarray(covers(vertex, triangles, point, fault)[0])
 
 
 def test_a_sample_exactly_on_an_edge_lies_in_one_of_its_triangles():
@@ -116,5 +48,5 @@ def test_a_sample_in_front_of_the_triangle_is_lit_and_the_mirrored_cone_is_empty
         vertex = tuple(jnp.asarray(corners[:, c]) for c in range(3))
         sample = tuple(jnp.asarray(points[:, c]) for c in range(3))
         for order in ([0, 1, 2], [0, 2, 1], [2, 1, 0]):
-            total, _ = covers_jit(vertex, np.array([order], np.int32), sample, "")
+            total, _ = covers(vertex, np.array([order], np.int32), sample, "")
             assert np.asarray(total).tolist() == [0, 0, 1, 1, 0, 0]
