@@ -1,4 +1,4 @@
-"""Runs of a benchmark side by side, each a line of a file: written as it is known, and not run again by the next call."""
+"""Runs of a benchmark side by side, each a line of a file: written as it is known, run once."""
 
 from __future__ import annotations
 

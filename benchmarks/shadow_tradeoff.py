@@ -3,12 +3,12 @@
 python -m benchmarks.shadow_tradeoff SCENE[,SCENE...] --out DIR [--scenes FOLDER] [--triangles 60000] [--size 1024]
     [--along 0] [--minutes 8] [--workers 1] [--only branching|tile_8|tile_32|trees]
 
-SCENE is `clumps`, a built-in name, or FOLDER/SCENE.glb with SCENE.cameras.json beside it. Branching at tiles of 8, tiles
-at 8 and at 32 children; and at 32 children, without feedback as in the paper, the full tree and two passes from each
-level. Each program runs from view samples to mask, capacities known. Programs are compiled side by side for three
-quarters of the time; then, with nothing beside, all are timed in turns, twice. A line of DIR/shadow-tradeoff-cpu.jsonl
-(or gpu) is a configuration; what is there, on this device and at this size, is not run again. Tables and charts of it:
-`python -m benchmarks.shadow_tradeoff_charts`.
+SCENE is `clumps`, a built-in name, or FOLDER/SCENE.glb with SCENE.cameras.json beside it. Branching at tiles of 8,
+tiles at 8 and at 32 children; and at 32 children, without feedback as in the paper, the full tree and two passes from
+either level. Each program runs from view samples to mask, capacities known. Programs are compiled side by side for
+four fifths of the time; then, with nothing beside, all are timed in turns, twice. A line of
+DIR/shadow-tradeoff-cpu.jsonl (or gpu) is a configuration; what is there, on this device and at this size, is not run
+again. Tables and charts of it: `python -m benchmarks.shadow_tradeoff_charts`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import argparse
 import os
 import threading
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -118,8 +118,8 @@ def prepare(key: str, subject: Subject, variant: Variant, one_at_once: threading
     frame = shadow_frame(case.samples, subject.casters, case.light, grid, case.bias_m, case.receives)
     if jax.default_backend() != "cpu":
         n_pairs = PAIRS if plan.passes == 2 else 0
-        sizes = {"groups": max(GROUPS, 2 * case.casters.n_triangles), "leaf_groups": LEAF_GROUPS, "pairs": n_pairs}
-        plan = ShadowPlan(**(asdict(plan) | sizes))
+        groups = max(GROUPS, 2 * case.casters.n_triangles)
+        plan = replace(plan, groups=groups, leaf_groups=LEAF_GROUPS, pairs=n_pairs)
 
     def run(plan: ShadowPlan, _: int) -> ShadowMask:
         with one_at_once:
@@ -229,7 +229,7 @@ def main() -> None:
             lines.add({"key": task[0], "failed": why(error)})
             print(f"{task[0]}: failed: {why(error)}", flush=True)
 
-    side_by_side(tasks, given.workers, started + 0.75 * (end - started), compile_one)
+    side_by_side(tasks, given.workers, started + 0.8 * (end - started), compile_one)
     done = list(ready)
     left = end - time.monotonic()
     print(f"{len(done)} compiled after {time.monotonic() - started:.0f} s", flush=True)
