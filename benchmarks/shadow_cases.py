@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,12 +71,9 @@ class Case:
     bias_m: float
 
 
-def read_case(scene_name: str, cameras: str | None, n_triangles: int, along: float, size_px: int) -> Case:
-    """A view of the clumps, of a built-in scene or of a file, at a share `along` of its path.
-
-    All triangles that are not blended cast, masked ones as if they were solid. The samples of the clumps are all
-    tested, as by the rays that they are compared with, elsewhere those that face the light.
-    """
+@functools.lru_cache
+def read_scene(scene_name: str, cameras: str | None, n_triangles: int) -> tuple[Scene, CameraPath]:
+    """The clumps, a built-in scene or a file, and its path."""
     if scene_name == "clumps":
         scene = clumps_scene(n_triangles)
     elif scene_name in GALLERY:
@@ -85,6 +83,25 @@ def read_case(scene_name: str, cameras: str | None, n_triangles: int, along: flo
     path = load_cameras(Path(cameras)) if cameras else scene.cameras
     if path is None:
         raise SystemExit(f"{scene_name}: has no cameras; give --cameras FILE.")
+    return scene, path
+
+
+def named_case(name: str, folder: Path | None, n_triangles: int, along: float, size_px: int) -> Case:
+    """A view as of `read_case`, of a built-in scene, or of `folder`/NAME.glb with NAME.cameras.json beside it."""
+    if name in GALLERY or name == "clumps":
+        return read_case(name, None, n_triangles, along, size_px)
+    if folder is None:
+        raise SystemExit(f"{name}: is not built in; give --scenes FOLDER that has {name}.glb.")
+    return read_case(str(folder / f"{name}.glb"), str(folder / f"{name}.cameras.json"), n_triangles, along, size_px)
+
+
+def read_case(scene_name: str, cameras: str | None, n_triangles: int, along: float, size_px: int) -> Case:
+    """A view of the clumps, of a built-in scene or of a file, at a share `along` of its path.
+
+    All triangles that are not blended cast, masked ones as if they were solid. The samples of the clumps are all
+    tested, as by the rays that they are compared with, elsewhere those that face the light.
+    """
+    scene, path = read_scene(scene_name, cameras, n_triangles)
     frame = int(along * len(path.poses))
     samples = trace_view_samples(scene, at_size(path.camera(frame), size_px))
     low, high = scene.bounds_m

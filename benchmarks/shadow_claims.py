@@ -1,45 +1,58 @@
 """What the papers of 2011 and 2014 say of their shadow algorithms, counted again.
 
-python -m benchmarks.shadow_claims --out DIR [--scene BUILT_IN|FILE] [--triangles 60000] [--cameras FILE]
-    [--frames 3] [--size 1024] [--small 256] [--minutes 20] [--workers 1]
+python -m benchmarks.shadow_claims SCENE[,SCENE...] --out DIR [--scenes FOLDER] [--triangles 60000] [--frames 8]
+    [--size 1024] [--large 4096] [--minutes 20] [--workers 1]
 
-Counts alone: they are the same on every device. Growth is from `small` to `size`; the papers' is from 1024 to 4096
-squared, 16 times the samples too. Tiles of 8 pixels and 32 children, as the papers. Frames lie evenly on the path; all
-but the last claim are of the first one. What finds no time left is a line of the table too.
+SCENE is a built-in name, or FOLDER/SCENE.glb with SCENE.cameras.json beside it. Counts alone: they are the same on
+every device. Growth is from `size` to `large`; the papers' is from 1024 to 4096 squared, 16 times the samples. Tiles of
+8 pixels and 32 children, as the papers; the stencil's own counts do not depend on tiles, which are of 16 at `large`.
+Frames lie evenly on the path; all but the last claim are of the first one. A count is a line of
+DIR/shadow-claims-SCENE-SIZE.jsonl, written as it is known and not counted again by the next call; one that failed says
+why. DIR/shadow-claims-SCENE-SIZE.md is the table of what is known.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import functools
+import os
+import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import numpy as np
 
-from benchmarks.shadow_cases import Case, read_case
-from vtfs.device import keep_compiled_programs
+from benchmarks.run_lines import RunLines, side_by_side, why
+from benchmarks.shadow_cases import Case, named_case
+from vtfs.device import device_name, keep_compiled_programs
 from vtfs.files import write_atomically
 from vtfs.shadow_casters import FrontFaces
-from vtfs.shadow_mask import ShadowPlan
-from vtfs.shadow_techniques import cast_shadows
+from vtfs.shadow_mask import ShadowMask, ShadowPlan, casters_on_device, shadow_frame
+from vtfs.shadow_techniques import fitted_to_all, run_program, shadow_counts, shadow_grid
 
 PAPER = ShadowPlan(tile_px=8, branching=32, feedback=False)
 SILHOUETTE, NO_PLANES = replace(PAPER, extra="silhouette"), replace(PAPER, extra="off")
 IMPLICIT, FEEDBACK = replace(PAPER, bounds="implicit"), replace(PAPER, feedback=True)
 TWO_PASSES, FULL = replace(PAPER, passes=2), replace(PAPER, tree="full")
+LARGE_TILES = replace(PAPER, tile_px=16)
 
 
 @dataclass(frozen=True)
 class Run:
-    """One technique on one case; `front_faces` as in `shadow_frame`."""
+    """One technique on one case: `first`, `large` or a share of the path, `1/8`; `front_faces` as in `shadow_frame`."""
 
     technique: str
     plan: ShadowPlan
     case: str = "first"
     front_faces: FrontFaces = "cast"
+
+    @property
+    def key(self) -> str:
+        default = ShadowPlan()
+        plan = [f"{k}={v}" for k, v in vars(self.plan).items() if v != getattr(default, k)]
+        return " ".join([self.technique, *plan, self.case, *(["culled"] if self.front_faces == "culled" else [])])
 
 
 @dataclass(frozen=True)
@@ -65,88 +78,148 @@ def of(run: Run, **changes) -> Run:
     return replace(run, **changes)
 
 
+ON_LARGE = of(Z_PASS, plan=LARGE_TILES, case="large"), of(PTSV, case="large"), of(CLUSTERS, case="large")
+Z_LARGE, PTSV_LARGE, CLUSTERS_LARGE = ON_LARGE
+
 CLAIMS = (
-    Claim("ptsv: fewer test-and-set than z_pass (2011: 19.7 M to 1.2 M, 10 in the abstract)", Z_PASS, PTSV, 10, 17),
-    Claim("clusters, explicit bounds: fewer than ptsv (2014, Sec. 2.1: more than 2)", PTSV, CLUSTERS, 2, np.inf),
-    Claim("clusters: front-face culling (2011, of ptsv: 2.2)", CLUSTERS, of(CLUSTERS, front_faces="culled"), 2, 2.4),
-    Claim("ptsv: front-face culling (2011: 2.2)", PTSV, of(PTSV, front_faces="culled"), 2, 2.4),
-    Claim("ptsv: growth with 16 times the samples (2011: 2 to 4)", PTSV, of(PTSV, case="small"), 2, 4),
-    Claim("z_pass: growth with 16 times the samples (2011: 16)", Z_PASS, of(Z_PASS, case="small"), 15, 17),
-    Claim("clusters: growth with 16 times the samples", CLUSTERS, of(CLUSTERS, case="small"), 2, 4),
+    Claim("`ptsv`: fewer test-and-set than z_pass (2011: 19.7 M to 1.2 M, 10 in the abstract)", Z_PASS, PTSV, 10, 17),
+    Claim("the same, 16 times the samples", Z_LARGE, PTSV_LARGE, 10, np.inf),
+    Claim("z_pass over z_fail (2011: 19.7 M to 18.3 M)", Z_PASS, Z_FAIL, 1.0, 1.2),
+    Claim("`ptsv` over clusters, explicit bounds (2014, Sec. 2.1: more than 2)", PTSV, CLUSTERS, 2, np.inf),
+    Claim("the same, sample tests alone", PTSV, CLUSTERS, 2, np.inf, "sample_tests"),
+    Claim("`ptsv`: front-face culling (2011: 2.2)", PTSV, of(PTSV, front_faces="culled"), 2, 2.4),
+    Claim("clusters: front-face culling", CLUSTERS, of(CLUSTERS, front_faces="culled"), 2, 2.4),
+    Claim("z_pass: growth with 16 times the samples (2011: 16)", Z_LARGE, Z_PASS, 15, 17),
+    Claim("`ptsv`: growth with 16 times the samples (2011: 2 to 4)", PTSV_LARGE, PTSV, 2, 4),
+    Claim("clusters: growth with 16 times the samples (2 to 4)", CLUSTERS_LARGE, CLUSTERS, 2, 4),
     Claim("clusters: their number at 1024 squared (2014: at most 52,000)", CLUSTERS, None, 0, 52_000, "items"),
     Claim("clusters: work of the 1,024 largest triangles over the average (2014: 10)", CLUSTERS, None, 8, 12, "work"),
-    Claim("z_fail: fewer than z_pass (2011: 19.7 M to 18.3 M)", Z_PASS, Z_FAIL, 1.0, 1.2),
-    Claim("clusters: implicit over explicit bounds", of(CLUSTERS, plan=IMPLICIT), CLUSTERS, 1, 2),
-    Claim("clusters: without extra planes", of(CLUSTERS, plan=NO_PLANES), CLUSTERS, 1, 2),
-    Claim("ptsv: without silhouette planes", of(PTSV, plan=NO_PLANES), PTSV, 1, 2),
-    Claim("clusters: two passes over one, tests", of(CLUSTERS, plan=TWO_PASSES), CLUSTERS, 0.99, 1.01),
-    Claim("clusters: full tree over compact, tests", of(CLUSTERS, plan=FULL), CLUSTERS, 0.5, 1.5),
-    Claim("clusters: without feedback over with it (ours)", CLUSTERS, of(CLUSTERS, plan=FEEDBACK), 1, 4),
+    Claim("clusters: implicit over explicit bounds (more)", of(CLUSTERS, plan=IMPLICIT), CLUSTERS, 1, np.inf),
+    Claim("clusters: without extra planes (more)", of(CLUSTERS, plan=NO_PLANES), CLUSTERS, 1, np.inf),
+    Claim("`ptsv`: without silhouette planes (more)", of(PTSV, plan=NO_PLANES), PTSV, 1, np.inf),
+    Claim("clusters: two passes over one, tests (the same)", of(CLUSTERS, plan=TWO_PASSES), CLUSTERS, 0.99, 1.01),
+    Claim("clusters: full tree over compact, tests (about the same)", of(CLUSTERS, plan=FULL), CLUSTERS, 0.5, 1.5),
+    Claim("clusters: without feedback over with it (ours)", CLUSTERS, of(CLUSTERS, plan=FEEDBACK), 1, np.inf),
 )  # fmt: skip
 
+GROUPS, LEAF_GROUPS, PAIRS = 2**20, 2**23, 2**22
+"""Of a GPU: memory is at hand there, and each step up compiles."""
 
-def counted(run: Run, cases: dict[str, Case]) -> dict[str, float]:
-    case = cases[run.case]
-    found = cast_shadows(
-        run.technique, run.plan, case.samples, case.casters, case.light,
-        front_faces=run.front_faces, receives=case.receives, bias_m=case.bias_m,
-    )  # fmt: skip
-    counts = dict(found.counts)
+
+def counted(run: Run, case: Case, one_at_once: threading.Lock) -> dict[str, float]:
+    """Counts of a run; `one_at_once` holds what runs on the device."""
+    plan = run.plan
+    casters = casters_on_device(case.casters)
+    grid = shadow_grid(case.samples, plan.tile_px)
+    frame = shadow_frame(
+        case.samples, casters, case.light, grid, case.bias_m, case.receives, front_faces=run.front_faces
+    )
+    if jax.default_backend() != "cpu":
+        n_pairs = PAIRS if plan.passes == 2 else 0
+        groups = max(GROUPS, 2 * case.casters.n_triangles)
+        leaf_groups = LEAF_GROUPS if run.technique in ("ptsv", "cluster_hierarchy") else 4 * LEAF_GROUPS
+        plan = replace(plan, groups=groups, leaf_groups=leaf_groups, pairs=n_pairs)
+
+    def one(plan: ShadowPlan, _: int) -> ShadowMask:
+        with one_at_once:
+            return jax.block_until_ready(run_program(run.technique, plan, frame))
+
+    plan, (mask,) = fitted_to_all(run.technique, plan, [frame], unrolled=False, run=one)
+    counts = shadow_counts(mask, frame, plan)
     tests = counts["node_tests"] + counts["sample_tests"]
     average = tests / max(counts["casters"], 1)
-    return counts | {"work": counts["tests_of_largest"] / min(1_024, max(counts["casters"], 1)) / max(average, 1e-9)}
+    work = counts["tests_of_largest"] / min(1_024, max(counts["casters"], 1)) / max(average, 1e-9)
+    return {**counts, "work": work}
+
+
+def table(scene: str, known: dict[str, dict], n_frames: int, failed: dict[str, str]) -> str:
+    """What is claimed and what was counted, in Markdown."""
+    rows = [f"{scene}", "", "| claim | papers | here | counts | |", "| --- | --- | --- | --- | --- |"]
+    for claim in CLAIMS:
+        parts = [claim.over, *([claim.under] if claim.under else [])]
+        if missing := [run.key for run in parts if run.key not in known]:
+            why_not = "; ".join(failed.get(key, "not counted yet") for key in missing)
+            rows.append(f"| {claim.text} | {_range(claim)} | | | {why_not} |")
+            continue
+        values = [known[run.key]["counts"][claim.count] for run in parts]
+        value = values[0] / max(values[1], 1) if len(values) == 2 else values[0]
+        verdict = "agrees" if claim.low <= value <= claim.high else "differs"
+        each = ", ".join(f"{v:,.0f}" for v in values) if len(values) == 2 else ""
+        rows.append(f"| {claim.text} | {_range(claim)} | {value:,.2f} | {each} | {verdict} |")
+    of_frames = [known[run.key]["counts"]["test_and_set"] for run in path_runs(n_frames) if run.key in known]
+    if of_frames:
+        value = max(of_frames) / float(np.median(of_frames))
+        text = f"clusters: frame with most tests over the median, {len(of_frames)} frames (time up to 7)"
+        each = f"{max(of_frames):,}, {np.median(of_frames):,.0f}"
+        rows.append(f"| {text} | 1 to 7 | {value:,.2f} | {each} | {'agrees' if value <= 7 else 'differs'} |")
+    return "\n".join(rows) + "\n"
+
+
+def _range(claim: Claim) -> str:
+    return f"{claim.low:,g} to {claim.high:,g}" if claim.high < np.inf else f"over {claim.low:g}"
+
+
+def path_runs(n_frames: int) -> list[Run]:
+    """The clusters on frames spread evenly over the path."""
+    return [CLUSTERS, *(of(CLUSTERS, case=f"{k}/{n_frames}") for k in range(1, n_frames))]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--scene", default="grove")
+    parser.add_argument("--scenes", type=Path)
     parser.add_argument("--triangles", type=int, default=60_000)
-    parser.add_argument("--cameras")
-    parser.add_argument("--frames", type=int, default=3)
+    parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--size", type=int, default=1024)
-    parser.add_argument("--small", type=int, default=256)
+    parser.add_argument("--large", type=int, default=4096)
     parser.add_argument("--minutes", type=float, default=20.0)
     parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     end = time.monotonic() + 60 * given.minutes
     keep_compiled_programs()
+    scenes = given.scene.split(",")
+    lines = {scene: RunLines(given.out / f"shadow-claims-{scene}-{given.size}.jsonl") for scene in scenes}
+    known = {scene: lines[scene].known() for scene in scenes}
+    tracing, one_at_once = threading.Lock(), threading.Lock()
 
-    def case_of(share: float, size: int) -> Case:
-        return read_case(given.scene, given.cameras, given.triangles, share, size)
+    @functools.cache
+    def traced(scene: str, name: str) -> Case:
+        share = int(name.split("/")[0]) / given.frames if "/" in name else 0.0
+        size = given.large if name == "large" else given.size
+        return named_case(scene, given.scenes, given.triangles, share, size)
 
-    cases = {"first": case_of(0.0, given.size), "small": case_of(0.0, given.small)}
-    shares = {f"{k} of {given.frames}": k / given.frames for k in range(1, given.frames)}
-    cases |= {name: case_of(share, given.size) for name, share in shares.items()}
-    on_path = [CLUSTERS, *(of(CLUSTERS, case=name) for name in shares)]
-    runs = [*dict.fromkeys(run for claim in CLAIMS for run in (claim.over, claim.under) if run), *on_path[1:]]
-    record: dict = {"scene": cases["first"].name, "claims": [], "runs": []}
-    out = given.out / f"shadow-claims-{cases['first'].name.split(' (')[0].replace(' ', '-')}.json"
-    print(f"{record['scene']}: {int(cases['first'].receives.sum()):,} samples", flush=True)
+    def case_of(scene: str, name: str) -> Case:
+        with tracing:
+            return traced(scene, name)
 
-    def count_in_time(run: Run) -> dict[str, float] | None:
-        return counted(run, cases) if time.monotonic() < end else None
+    runs = [run for claim in CLAIMS for run in (claim.over, claim.under) if run]
+    # What compiles least comes first: on the path nothing does after the first frame.
+    runs = sorted(dict.fromkeys(runs + path_runs(given.frames)), key=lambda run: run.case == "large")
+    tasks = [(scene, run) for run in runs for scene in scenes if run.key not in known[scene]]
+    print(f"{device_name()}: {len(tasks)} counts to make", flush=True)
 
-    # Most of the time is the compiler's, and it runs side by side.
-    with ThreadPoolExecutor(given.workers) as pool:
-        counts = dict(zip(runs, pool.map(count_in_time, runs), strict=True))
-    record["runs"] = [{"run": str(run), "counts": found} for run, found in counts.items()]
+    def count(task: tuple[str, Run]) -> None:
+        scene, run = task
+        try:
+            case = case_of(scene, run.case)
+            started = time.monotonic()
+            counts = counted(run, case, one_at_once)
+            found = f"{counts['test_and_set']:,} tests, {time.monotonic() - started:.0f} s"
+            line = {"key": run.key, "case": case.name, "device": device_name(), "counts": counts}
+        except Exception as error:  # one that fails is a line too, and the others go on
+            found = why(error)
+            line = {"key": run.key, "failed": found}
+        lines[scene].add(line)
+        print(f"{scene}: {run.key}: {found}", flush=True)
 
-    def report(text: str, value: float | None, low: float, high: float) -> None:
-        verdict = "no time left" if value is None else "agrees" if low <= value <= high else "differs"
-        record["claims"].append({"claim": text, "value": value, "low": low, "high": high, "verdict": verdict})
-        print(f"{text:<88}{'' if value is None else f'{value:>12,.2f}'}  {verdict}", flush=True)
-
-    for claim in CLAIMS:
-        over, under = counts[claim.over], None if claim.under is None else counts[claim.under]
-        known = over is not None and (claim.under is None or under is not None)
-        value = over[claim.count] / max(under[claim.count] if under else 1.0, 1.0) if over and known else None
-        report(claim.text, value, claim.low, claim.high)
-    of_frames = [found["test_and_set"] for run in on_path if (found := counts[run])]
-    value = max(of_frames) / float(np.median(of_frames)) if len(of_frames) == given.frames else None
-    report("clusters: frame with most tests over the median (other measurements: time up to 7)", value, 1, 7)
-    write_atomically(out, json.dumps(record, indent=1).encode())
-    print(out)
+    side_by_side(tasks, given.workers, end, count)
+    for scene in scenes:
+        failed = {line["key"]: line["failed"] for line in lines[scene].lines if "failed" in line}
+        text = table(scene, lines[scene].known(), given.frames, failed)
+        write_atomically(given.out / f"shadow-claims-{scene}-{given.size}.md", text.encode())
+        print(text, flush=True)
+    os._exit(0)  # what still compiles is not waited for
 
 
 if __name__ == "__main__":
