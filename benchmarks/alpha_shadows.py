@@ -16,7 +16,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from vtfs.alpha_casters import AlphaCasters, Blending, SceneCasters, scene_casters
+from vtfs.alpha_casters import AlphaCasters, Blending, SceneCasters, scene_bias_m, scene_casters
 from vtfs.camera import Viewport
 from vtfs.gallery import build_scene
 from vtfs.sample_patterns import extrapolated_sub_samples, resolved, traced_sub_samples
@@ -26,7 +26,7 @@ from vtfs.shadow_mask import ShadowPlan, facing_samples
 from vtfs.shadow_references import brute_force, classify, view_points_m
 from vtfs.tracer import Tracer
 from vtfs.transmittance_references import ReferenceLight, brute_force_transmittance
-from vtfs.transmitted_light import scene_bias_m, transmitted_light
+from vtfs.transmitted_light import transmitted_light
 from vtfs.view_samples import ViewSamples, trace_view_samples
 
 _VARIANTS: tuple[tuple[str, ShadowPlan, Blending], ...] = (
