@@ -75,7 +75,8 @@ def test_stochastic_panes_let_each_sample_have_all_of_a_light_or_none():
     assert abs(maps.shadowed.sum() - 128) < 6 * 8 and len(np.unique(maps.shadowed)) == 3
     found, full = render(config, inputs), render(lit, inputs)
     assert (found[maps.shadowed == 2] == 0).all()
-    assert (found[maps.shadowed == 0] == full[maps.shadowed == 0]).all()
+    whole = maps.shadowed == 0
+    assert np.abs(found[whole] / full[whole] - 1).max() < 4 * 2.0**-23  # another program, other fused sums
     assert np.array_equal(found, render(configuration("brute_force", {"blending": "stochastic"}), inputs))
 
 
