@@ -11,13 +11,14 @@ import numpy as np
 from vtfs.alpha_casters import Blending, Casting
 from vtfs.cache import cached
 from vtfs.gbuffer import from_runs
+from vtfs.input_error import InputError
 from vtfs.layers import Layers, TransparentLayer
 from vtfs.light_shadows import CastMask
 from vtfs.lights import Lights
 from vtfs.parameters import Configuration
 from vtfs.reference import ViewShadows, forward_reference
 from vtfs.shadow_casters import FrontFaces
-from vtfs.shadow_inputs import FrameShadows
+from vtfs.shadow_inputs import FrameShadows, ShadowScene
 from vtfs.shadow_references import brute_force, classify, kept_casters, view_points_m
 from vtfs.view_samples import ViewSamples
 
@@ -213,6 +214,15 @@ class ShadowChecker:
         image, left = self.image(casting).copy(), self._left.get(casting)
         image[pixels] = forward_reference(some, self._lights, self._of_views(masks, left))[pixels]
         return image
+
+
+def one_blending(configurations: Sequence[Configuration], scene: ShadowScene) -> None:
+    """**Raises:** `InputError` where configurations would not cast the same shadows, or one cannot cast them."""
+    found = list(dict.fromkeys(scene.blending(config) for config in configurations))
+    if len(found) > 1:
+        raise InputError(
+            f"parameter `blending` = {', '.join(found)}: are different shadows: give one, to compare their times."
+        )
 
 
 def light_on_host(masks: Sequence[CastMask], samples: ViewSamples) -> list[np.ndarray]:

@@ -89,6 +89,19 @@ class ShadowScene:
             default_bias_m(self.casters) if self.alpha is None else scene_bias_m(SceneCasters(self.casters, self.alpha))
         )
 
+    def blending(self, config: Configuration) -> Casting:
+        """What alpha casters do to light; `opaque` also where there are none.
+
+        **Raises:** `InputError` where there are, and the technique cannot cast by them.
+        """
+        casting: Casting = config["blending"] if self.alpha is not None else "opaque"  # type: ignore[assignment]
+        if casting != "opaque" and config.technique in STENCIL_NAMES:
+            raise InputError(
+                f"technique `{config.technique}`: a stencil cannot cast by this scene's alpha-masked and blended "
+                "triangles; use ptsv or cluster_hierarchy, or blending=opaque, with which only opaque ones cast."
+            )
+        return casting
+
     @cached_property
     def rays(self) -> ShadowRays:
         return ShadowRays(self.casters)
@@ -224,17 +237,7 @@ class FrameShadows:
         return tuple((own, part.gbuffer(own, "float32").normal) for part, own in zip(fragments, positions, strict=True))
 
     def blending(self, config: Configuration) -> Casting:
-        """What alpha casters do to light; `opaque` also where there are none.
-
-        **Raises:** `InputError` where there are, and the technique cannot cast by them.
-        """
-        casting: Casting = config["blending"] if self.scene.alpha is not None else "opaque"  # type: ignore[assignment]
-        if casting != "opaque" and config.technique in STENCIL_NAMES:
-            raise InputError(
-                f"technique `{config.technique}`: a stencil cannot cast by this scene's alpha-masked and blended "
-                "triangles; use ptsv or cluster_hierarchy, or blending=opaque, with which only opaque ones cast."
-            )
-        return casting
+        return self.scene.blending(config)
 
     def _alpha_task(self, casting: Casting, view: int, slot: int) -> AlphaTask | None:
         if casting == "opaque":

@@ -10,7 +10,7 @@ import pytest
 
 from tests.strategies import nearby_lights
 from tests.vtfs.test_shadowed_frame import SUNS
-from tuning.shadow_check import ShadowChecker, light_on_host, masks_on_host
+from tuning.shadow_check import ShadowChecker, light_on_host, masks_on_host, one_blending
 from vtfs.alpha_casters import Blending
 from vtfs.camera import Camera, Viewport
 from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
@@ -156,7 +156,15 @@ def test_a_stencil_refuses_alpha_casters_by_name_and_casts_by_opaque_ones_when_t
     inputs, _ = conservatory()
     with pytest.raises(InputError, match=r"`z_fail`: a stencil cannot cast .* or blending=opaque"):
         render(configuration("z_fail"), inputs)
-    assert inputs.shadows.blending(configuration("z_fail", {"blending": "opaque"})) == "opaque"
+    scene, opaque = inputs.shadows.scene, configuration("z_fail", {"blending": "opaque"})
+    assert scene.blending(opaque) == "opaque"
+    one_blending([opaque, PTSV.replaced(blending="opaque")], scene)
+    with pytest.raises(InputError, match="`blending` = opaque, grey: are different shadows"):
+        one_blending([opaque, PTSV], scene)
+    with pytest.raises(InputError, match="`z_fail`: a stencil cannot"):
+        one_blending([PTSV, configuration("z_fail")], scene)
+    without = floor_under_glass("opaque").shadows.scene
+    one_blending([configuration("z_fail"), PTSV.replaced(blending="coloured")], without)
 
 
 def test_without_alpha_casters_a_frame_has_the_programs_of_opaque_ones():
