@@ -1,8 +1,8 @@
 """Alpha casters: are they exact, what do they cost, and what do several samples a pixel gain?
 
-python benchmarks/alpha_shadows.py exactness [SIZE]      variants against float64, gallery scenes
-python benchmarks/alpha_shadows.py antialiasing [WxH]    4, 8, 16 samples, traced against extrapolated
-python benchmarks/alpha_shadows.py cost [WxH]            opaque alone, and with alpha casters, beside brute force
+python benchmarks/alpha_shadows.py exactness [SIZE] [SCENE]   variants against float64, gallery scenes
+python benchmarks/alpha_shadows.py antialiasing [WxH]     4, 8, 16 samples, traced against extrapolated
+python benchmarks/alpha_shadows.py cost [WxH]             opaque alone, and with alpha casters, beside brute force
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from vtfs.alpha_casters import AlphaCasters, Blending, SceneCasters, scene_casters
+from vtfs.alpha_casters import AlphaCasters, Blending, SceneCasters, scene_bias_m, scene_casters
 from vtfs.camera import Viewport
 from vtfs.gallery import build_scene
 from vtfs.sample_patterns import extrapolated_sub_samples, resolved, traced_sub_samples
@@ -26,7 +26,7 @@ from vtfs.shadow_mask import ShadowPlan, facing_samples
 from vtfs.shadow_references import brute_force, classify, view_points_m
 from vtfs.tracer import Tracer
 from vtfs.transmittance_references import ReferenceLight, brute_force_transmittance
-from vtfs.transmitted_light import scene_bias_m, transmitted_light
+from vtfs.transmitted_light import transmitted_light
 from vtfs.view_samples import ViewSamples, trace_view_samples
 
 _VARIANTS: tuple[tuple[str, ShadowPlan, Blending], ...] = (
@@ -42,7 +42,7 @@ def main() -> None:
     question, size = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else ""
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {' '.join(sys.argv[1:])}\n")
     if question == "exactness":
-        exactness(int(size or 128))
+        exactness(int(size or 128), sys.argv[3] if len(sys.argv) > 3 else "")
     else:
         width, height = map(int, (size or "320x180").split("x"))
         (antialiasing if question == "antialiasing" else cost)(Viewport(width, height))
@@ -56,14 +56,16 @@ def light_in(scene: Scene, at: tuple[float, float, float]) -> ShadowLight:
 # --- exactness ------------------------------------------------------------------------------------------------------
 
 
-def exactness(size_px: int) -> None:
-    """Techniques, plans and blendings against the product over all triangles."""
+def exactness(size_px: int, only: str) -> None:
+    """Techniques, plans and blendings against the product over all triangles; of both scenes unless one is named."""
     print("| scene | view | technique | plan | blending | samples | largest error | in bands | errors |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for name, n_triangles, frame, at in (
         ("conservatory", 12_000, 12, (0.45, 1.2, 0.8)),
         ("grove", 12_000, 5, (0.4, 1.1, 0.6)),
     ):
+        if only not in ("", name):
+            continue
         scene = build_scene(name, n_triangles)
         assert scene.cameras is not None
         samples = trace_view_samples(scene, replace(scene.cameras.camera(frame), viewport=Viewport(size_px, size_px)))

@@ -59,6 +59,7 @@ _STAGE_COLOURS = {
     "shadow_build": "#8d7fa8",
     "shadow_traverse": "#6a5b8a",
     "shadow_merge": "#c5b2a0",
+    "shadow_transmit": "#8fa39a",
     "shadow_bits": "#a08f86",
 }
 _OTHER_STAGE_COLOUR = "#b9bfc5"

@@ -25,6 +25,14 @@ STAGE_TERMS: dict[str, tuple[str, ...]] = {
     "shadow_build": ("shadow_samples", "shadow_clusters"),
     "shadow_traverse": ("node_tests", "sample_tests", "listed_pairs", "extra_plane_tests"),
     "shadow_merge": ("shadow_samples", "shadow_clusters"),
+    "shadow_transmit": (
+        "alpha_casters",
+        "alpha_samples",
+        "alpha_clusters",
+        "alpha_node_tests",
+        "alpha_sample_tests",
+        "alpha_listed_pairs",
+    ),
     "frame": (
         "samples",
         "cells_total",
@@ -39,6 +47,8 @@ STAGE_TERMS: dict[str, tuple[str, ...]] = {
         "sample_tests",
         "listed_pairs",
         "shadow_clusters",
+        "alpha_node_tests",
+        "alpha_sample_tests",
     ),
 }
 """Candidate terms of each stage, the first of two that say the same preferred."""
@@ -80,7 +90,8 @@ def main_work(counts: Mapping[str, int]) -> int:
     """What tells busy frames and hopeless techniques: nodes and samples tested against triangles where shadows are
     cast, else lighting computations."""
     if "shadow_lights" in counts:
-        return counts.get("node_tests", 0) + counts.get("sample_tests", 0)
+        tests = ("node_tests", "sample_tests", "alpha_node_tests", "alpha_sample_tests")
+        return sum(counts.get(name, 0) for name in tests)
     return counts.get("lighting_computations", 0)
 
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vtfs.alpha_casters import Blending, Casting
 from vtfs.cache import cached
 from vtfs.gbuffer import from_runs
+from vtfs.input_error import InputError
 from vtfs.layers import Layers, TransparentLayer
+from vtfs.light_shadows import CastMask
 from vtfs.lights import Lights
 from vtfs.parameters import Configuration
 from vtfs.reference import ViewShadows, forward_reference
 from vtfs.shadow_casters import FrontFaces
-from vtfs.shadow_inputs import FrameShadows
+from vtfs.shadow_inputs import FrameShadows, ShadowScene
 from vtfs.shadow_references import brute_force, classify, kept_casters, view_points_m
 from vtfs.view_samples import ViewSamples
 
@@ -23,6 +27,15 @@ MOST_IN_BANDS = 1e-3
 
 _GRAZING = 1e-6
 """Cosine below which rounding decides whether a surface faces the light; it is black there, in shadow or not."""
+
+LIGHT_ERROR = 1e-5
+"""Largest difference of a transmittance from float64: it is a product in float64, rounded to float32 (6e-8)."""
+
+_DECISION_MARGIN = 1e-9
+"""Of an alpha from its cutoff, or from a random number: below it roundings of texture coordinates decide."""
+
+_MOST_ALPHA_SAMPLES, _MOST_ALPHA_PAIRS = 2**14, 2**30
+"""Samples on which alpha casters are checked, of all lights and views, and pairs of them with triangles: some 10 s."""
 
 _MOST_CLASSIFIED = 200
 """Each costs a look at all casters; of more mismatches so many, evenly spread, are looked at."""
@@ -45,7 +58,8 @@ class ShadowChecker:
     def __init__(self, shadows: FrameShadows, samples: ViewSamples, lights: Lights, key: tuple[str, ...]):
         self._shadows, self._samples, self._lights, self._key = shadows, samples, lights, key
         self._masks: dict[FrontFaces, np.ndarray] = {}
-        self._image: np.ndarray | None = None
+        self._images: dict[Casting, np.ndarray] = {}
+        self._left: dict[Casting, np.ndarray] = {}
 
     def masks(self, front_faces: FrontFaces) -> np.ndarray:
         """By Embree: bool `[views, slots, h, w]`."""
@@ -64,21 +78,45 @@ class ShadowChecker:
             self._masks[front_faces] = np.unpackbits(bits, axis=-1, count=width).astype(bool)
         return self._masks[front_faces]
 
-    def image(self) -> np.ndarray:
-        """The float64 image under the shadows that Embree finds, with all casters."""
-        if self._image is None:
+    def image(self, casting: Casting = "opaque") -> np.ndarray:
+        """The float64 image under the shadows that Embree finds, with all casters.
+
+        Alpha casters leave the light that the first configuration with such casters found and that was checked: no ray
+        of Embree's finds it, and float64 for every sample would take hours.
+        """
+        if casting not in self._images:
+            left = self._left.get(casting)
 
             def shade() -> dict[str, np.ndarray]:
-                return {"image": forward_reference(self._samples, self._lights, self._of_views(self.masks("cast")))}
+                of_views = self._of_views(self.masks("cast"), left)
+                return {"image": forward_reference(self._samples, self._lights, of_views)}
 
-            self._image = cached("references", (*self._key, "shadowed"), shade)["image"]
-        return self._image
+            alpha = () if left is None else (casting, hashlib.sha256(left.tobytes()).hexdigest())
+            self._images[casting] = cached("references", (*self._key, "shadowed", *alpha), shade)["image"]
+        return self._images[casting]
 
-    def check(self, config: Configuration, masks: Sequence[np.ndarray]) -> MaskCheck:
+    def check(self, config: Configuration, masks: Sequence[np.ndarray], left: Sequence[np.ndarray] = ()) -> MaskCheck:
         """Compare the masks `[h, w]` of all slots on each view with those of the same casters.
 
         Where they differ from Embree's, which is float32, brute force in float64 decides.
+
+        **Arguments:**
+
+        - `left`: what alpha casters leave of each light, `[h, w, channels]`; compared with float64 on some samples.
         """
+        casting = self._shadows.blending(config)
+        if casting != "opaque":
+            wrong = self._wrong_light(casting, masks, left)
+            if casting not in self._left:
+                channels = np.array(left, np.float64).reshape(len(self._shadows.views), -1, *left[0].shape)
+                if wrong:
+                    return MaskCheck(
+                        wrong,
+                        forward_reference(self._samples, self._lights, self._of_views(self.masks("cast"), channels)),
+                    )
+                self._left[casting] = channels
+            if wrong:
+                return MaskCheck(wrong, self.image(casting))
         shadows = self._shadows
         n_slots = len(shadows.lights)
         front_faces: FrontFaces = config["front_faces"]  # type: ignore[assignment]
@@ -100,8 +138,10 @@ class ShadowChecker:
                 f"{n_edge:,} near an edge and {n_plane:,} near the plane of a caster"
             )
         if wrong or front_faces == "culled" or not differs.any():
-            return MaskCheck(wrong, self.image())
-        return MaskCheck("", self._with_masks(np.where(differs, found, reference), np.any(differs, axis=(0, 1))))
+            return MaskCheck(wrong, self.image(casting))
+        return MaskCheck(
+            "", self._with_masks(np.where(differs, found, reference), np.any(differs, axis=(0, 1)), casting)
+        )
 
     def _by_reason(
         self, view: ViewSamples, k: int, mask: np.ndarray, differs: np.ndarray, front_faces: FrontFaces
@@ -131,21 +171,67 @@ class ShadowChecker:
         near = True if light.directional else length < range_m * (1 - 1e-6)
         return near & ((to * view.normal).sum(axis=-1) > _GRAZING * length)
 
-    def _of_views(self, masks: np.ndarray) -> list[ViewShadows]:
-        return [ViewShadows(self._shadows.slot, own, self._shadows.scene.suns) for own in masks]
+    def _of_views(self, masks: np.ndarray, left: np.ndarray | None) -> list[ViewShadows]:
+        of_views = [None] * len(masks) if left is None else left
+        suns = self._shadows.scene.suns
+        return [ViewShadows(self._shadows.slot, own, suns, light) for own, light in zip(masks, of_views, strict=True)]
 
-    def _with_masks(self, masks: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    def _wrong_light(self, blending: Blending, masks: Sequence[np.ndarray], left: Sequence[np.ndarray]) -> str:
+        """What is wrong with the light that alpha casters leave, on evenly spread samples that opaque ones miss."""
+        shadows, n_slots = self._shadows, len(self._shadows.lights)
+        alpha = shadows.scene.alpha
+        assert alpha is not None
+        most = min(_MOST_ALPHA_SAMPLES, _MOST_ALPHA_PAIRS // alpha.casters.n_triangles) // len(masks) + 1
+        n_tested = n_errors = n_bands = 0
+        for i, (mask, found) in enumerate(zip(masks, left, strict=True)):
+            v, k = divmod(i, n_slots)
+            view, light = shadows.views[v], shadows.lights[k]
+            lit = np.flatnonzero(shadows.lit_by(view, k) & self._not_grazing(view, k) & ~mask)
+            some = np.zeros(mask.shape, bool)
+            some.flat[lit[:: max(1, -(-len(lit) // most))]] = True
+            expected, margin = shadows.reference_light(v, k, some, blending)
+            error = np.abs(found - expected).max(axis=-1)[some]
+            differs = ~(error <= LIGHT_ERROR)
+            rounded = differs & (margin[some] < _DECISION_MARGIN)
+            points, eye_m = view_points_m(view, some), np.array(view.camera.eye_m)
+            bands = classify(points, differs & ~rounded, alpha.casters, light, shadows.bias_m, eye_m)
+            n_tested, n_errors = n_tested + len(points), n_errors + bands.errors
+            n_bands += bands.near_edge + bands.near_plane + int(rounded.sum())
+        if not n_errors and n_bands <= MOST_IN_BANDS * max(n_tested, 1000):
+            return ""
+        return (
+            f"transmittance: {n_errors:,} of {n_tested:,} samples are off by over {LIGHT_ERROR:g} against float64 "
+            f"brute force, besides {n_bands:,} near an edge, a plane or a cutoff of an alpha caster"
+        )
+
+    def _with_masks(self, masks: np.ndarray, pixels: np.ndarray, casting: Casting) -> np.ndarray:
         """The reference image, shaded again with other masks in the pixels where any has changed."""
         layers = tuple(
             TransparentLayer(replace(layer.samples, valid=layer.samples.valid & pixels), layer.opacity * pixels)
             for layer in self._samples.layers.transparent
         )
         some = replace(self._samples, valid=self._samples.valid & pixels, layers=Layers(lambda: layers))
-        image = self.image().copy()
-        image[pixels] = forward_reference(some, self._lights, self._of_views(masks))[pixels]
+        image, left = self.image(casting).copy(), self._left.get(casting)
+        image[pixels] = forward_reference(some, self._lights, self._of_views(masks, left))[pixels]
         return image
 
 
-def masks_on_host(masks: Sequence, samples: ViewSamples) -> list[np.ndarray]:
+def one_blending(configurations: Sequence[Configuration], scene: ShadowScene) -> None:
+    """**Raises:** `InputError` where configurations would not cast the same shadows, or one cannot cast them."""
+    found = list(dict.fromkeys(scene.blending(config) for config in configurations))
+    if len(found) > 1:
+        raise InputError(
+            f"parameter `blending` = {', '.join(found)}: are different shadows: give one, to compare their times."
+        )
+
+
+def light_on_host(masks: Sequence[CastMask], samples: ViewSamples) -> list[np.ndarray]:
+    """What alpha casters leave by `CastMask`s, `[h, w, channels]`; none where none cast."""
+    viewport = samples.camera.viewport
+    channels = [[from_runs(np.asarray(channel), viewport) for channel in mask.transmittance] for mask in masks]
+    return [np.stack(own, axis=-1) for own in channels if own]
+
+
+def masks_on_host(masks: Sequence[CastMask], samples: ViewSamples) -> list[np.ndarray]:
     """`CastMask`s as images `[h, w]`."""
     return [from_runs(np.asarray(mask.shadowed), samples.camera.viewport) for mask in masks]

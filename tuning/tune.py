@@ -19,6 +19,7 @@ from tuning.features import main_work
 from tuning.measurement import Measurement
 from tuning.run_pictures import draw
 from tuning.search_run import Progress
+from tuning.shadow_check import one_blending
 from tuning.space import Space, default_space
 from tuning.sweep import SearchResult, search
 from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_counts
@@ -73,6 +74,8 @@ def tune(
     )
     n_samples = setup.cameras.viewport.width_px * setup.cameras.viewport.height_px
     space = options.space or default_space(options.techniques, n_samples)
+    if casts and setup.shadow_scene is not None:
+        one_blending(space.configurations(), setup.shadow_scene)
     tell("measuring")
     found = search(
         space,

@@ -17,7 +17,7 @@ import numpy as np
 from tuning.choose import Objective, median_interval
 from tuning.compiles import Compiles
 from tuning.measurement import Measurement, Outcome
-from tuning.shadow_check import MaskCheck, ShadowChecker, masks_on_host
+from tuning.shadow_check import MaskCheck, ShadowChecker, light_on_host, masks_on_host
 from tuning.timing import interleaved_ms, repeats_ms, timed_ms
 from vtfs.cache import cached
 from vtfs.cell_maps import CellMaps, cell_maps
@@ -241,7 +241,7 @@ class SceneWorkload:
             key = (self.scene_key, f"frame {self.frames[0]}")
             self._checker = ShadowChecker(shadows, samples, self._path.lights, key)
         masks = cast_program(config.technique, planned(config, self._sizes_of(config)))(shadows.tasks(config))
-        return self._checker.check(config, masks_on_host(masks, samples))
+        return self._checker.check(config, masks_on_host(masks, samples), light_on_host(masks, samples))
 
     def _stages_ms(
         self, config: Configuration, sizes: Sizes, env: dict[str, Any]
@@ -251,7 +251,7 @@ class SceneWorkload:
         None where `env` is empty: of what has lost, and where the frame is one stage.
         """
         technique = REGISTRY[config.technique]
-        stages = technique.stages_of(technique.plan(config), self._inputs[0].has_transparent) if env else ()
+        stages = technique.stages_of(planned(config, sizes), self._inputs[0].has_transparent) if env else ()
         times: dict[str, tuple[tuple[float, ...], ...]] = {}
         unmeasured = ((),) * (len(self._inputs) - 1)
         for stage in stages:

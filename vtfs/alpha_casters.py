@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from vtfs.input_error import InputError
-from vtfs.shadow_casters import Casters, opaque_casters
+from vtfs.shadow_casters import BIAS, Casters, opaque_casters
 
 if TYPE_CHECKING:
     from vtfs.scene import Scene
@@ -21,6 +21,9 @@ Blending = Literal["grey", "coloured", "stochastic"]
 `coloured`: what its alpha covers lets its base colour through, so that a colour c of the light is stopped by the share
 `alpha * (1 - c)` (the transmission coefficient of McGuire and Enderton 2011). `stochastic`: it stops all of the light
 of a sample with probability alpha, else none."""
+
+Casting = Literal["opaque", "grey", "coloured", "stochastic"]
+"""What casts: opaque triangles alone, or all, and then what blended ones do to light."""
 
 LARGEST_ALPHA = 1 - 2.0**-26
 """Alphas are clamped here, as the logarithm of 1 - 1 is infinite: what stops all light still passes 1.5e-8 of it."""
@@ -108,6 +111,12 @@ def scene_casters(scene: Scene) -> SceneCasters:
         tuple(images),
     )
     return SceneCasters(opaque_casters(scene), alpha)
+
+
+def scene_bias_m(casters: SceneCasters) -> float:
+    """The share of the extent of all casters by which samples move toward the light."""
+    both = np.concatenate([casters.opaque.triangles, casters.alpha.casters.triangles])
+    return BIAS * Casters(casters.opaque.vertices_m, both).extent_m
 
 
 class AlphaSurfaces(eqx.Module):

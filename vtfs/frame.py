@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -17,10 +17,12 @@ from vtfs.frame_sizes import NO_SIZES, CapacityError, Sizes, rounded_up
 from vtfs.gbuffer import from_runs
 from vtfs.light_shadows import CastMask
 from vtfs.parameters import Configuration
-from vtfs.shadow_inputs import ShadowTask, receiving
+from vtfs.shadow_inputs import ShadowTask, alpha_receiving, receiving
 from vtfs.shadow_mask import ShadowMask, ShadowPlan
+from vtfs.shadow_stages import TRANSMIT
 from vtfs.shadow_techniques import (
     CastShadows,
+    alpha_plan,
     fitted_to_all,
     on_host,
     shadow_plan,
@@ -33,7 +35,8 @@ from vtfs.techniques import REGISTRY, Plan, Stage
 def planned(config: Configuration, sizes: Sizes) -> Plan:
     plan = REGISTRY[config.technique].plan(config)
     shadow = with_shadow_sizes(plan.shadow, sizes.shadow) if plan.shadow else None
-    return replace(plan, cells=sizes.cells, blocks=sizes.blocks, pairs=sizes.pairs, shadow=shadow)
+    alpha = with_shadow_sizes(alpha_plan(config), sizes.alpha) if sizes.alpha else None
+    return replace(plan, cells=sizes.cells, blocks=sizes.blocks, pairs=sizes.pairs, shadow=shadow, alpha=alpha)
 
 
 @functools.cache
@@ -64,6 +67,9 @@ def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
         env["assign"], env["cluster_light"] = result
     elif stage == "shadow_merge":
         env["shadow_merge"] = [CastMask(mask.shadowed, mask.overflowed) for mask in result]
+        env["shadow_masks"] = env["shadow_merge"]
+    elif stage == TRANSMIT:
+        env["shadow_masks"] = [mask for mask, _ in result]
     else:
         env[stage] = result
 
@@ -76,22 +82,22 @@ def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable
     """
     stages = REGISTRY[technique].stages_of(plan, has_transparent)
     casting = tuple(stage for stage in stages if stage.casting)
-    image = _fused(tuple(stage for stage in stages if not stage.casting), replace(plan, shadow=None))
+    image = _fused(tuple(stage for stage in stages if not stage.casting), replace(plan, shadow=None, alpha=None))
     if not casting:
         return image
     cast = cast_program(technique, plan)
 
     def run(env: dict[str, Any]):
         shading = {name: value for name, value in env.items() if name != "shadow_tasks"}
-        return image(shading | {casting[-1].name: cast(env["shadow_tasks"])})
+        return image(shading | {"shadow_masks": cast(env["shadow_tasks"])})
 
     return run
 
 
 def cast_program(technique: str, plan: Plan) -> Callable[[list[ShadowTask]], list[CastMask]]:
     """From view samples to the mask of one light on one view, fused, and run for each of them."""
-    casting = tuple(stage for stage in REGISTRY[technique].stages if stage.casting)
-    return _for_each_shadow(_fused_casting(casting, Plan(shadow=plan.shadow)))
+    casting = tuple(stage for stage in REGISTRY[technique].stages_of(plan, False) if stage.casting)
+    return _for_each_shadow(_fused_casting(casting, Plan(shadow=plan.shadow, alpha=plan.alpha)))
 
 
 @functools.cache
@@ -99,7 +105,9 @@ def _fused_casting(stages: tuple[Stage, ...], plan: Plan) -> Callable[[ShadowTas
     def run(task: ShadowTask) -> CastMask:
         env: dict[str, Any] = {"shadow_tasks": task}
         for stage in stages:
-            env[stage.name] = stage.run(plan, *(env[name] for name in stage.needs))
+            env[stage.name] = stage.run(stage.narrowed(plan), *(env[name] for name in stage.needs))
+        if stages[-1].name == TRANSMIT:
+            return env[TRANSMIT][0]
         mask = env[stages[-1].name]
         return CastMask(mask.shadowed, mask.overflowed)  # alone, so that XLA deletes the counting
 
@@ -169,9 +177,10 @@ def run_stages(
     fitting = Sizes(rounded_up("cells", grid_keys), rounded_up("blocks", n_runs), rounded_up("pairs", 0))
     sizes = fitting.covering(sizes) if sizes else fitting
     if "shadow_tasks" in env and not sizes.shadow:
-        sizes = replace(sizes, shadow=cast_counted(config, inputs)[1])
+        cast = cast_counted(config, inputs)
+        sizes = replace(sizes, shadow=cast.sizes, alpha=cast.alpha_sizes)
     kept = kept or KeptStages()
-    for stage in technique.stages_of(technique.plan(config), inputs.has_transparent):
+    for stage in technique.stages_of(planned(config, sizes), inputs.has_transparent):
         while True:
             plan = stage.narrowed(planned(config, sizes))
             result = kept.run(stage, plan, [env[name] for name in stage.needs])
@@ -189,10 +198,26 @@ def run_stages(
     return env, sizes
 
 
-def cast_counted(config: Configuration, inputs: FrameInputs) -> tuple[list[CastShadows], tuple[int, ...]]:
-    """Shadows of all lights on each view, with tests and counts, and the capacities that hold them."""
+@dataclass(frozen=True)
+class CastFrame:
+    """Shadows of all lights on each view, with tests and counts, and the capacities that hold them.
+
+    - `opaque`: by opaque casters; `alpha`: what alpha casters stop wholly of the rest, empty where none cast.
+    - `transmittance`: what those leave, of each light and view `[h, w, channels]`; empty likewise.
+    """
+
+    opaque: list[CastShadows]
+    sizes: tuple[int, ...]
+    alpha: list[CastShadows]
+    transmittance: list[np.ndarray]
+    alpha_sizes: tuple[int, ...]
+
+
+def cast_counted(config: Configuration, inputs: FrameInputs) -> CastFrame:
+    """Cast all shadows of a frame, stage by stage, with capacities that hold them."""
     tasks = inputs.shadows.tasks(config)
-    stages = [stage for stage in REGISTRY[config.technique].stages if stage.casting]
+    all_stages = [stage for stage in REGISTRY[config.technique].stages if stage.casting]
+    stages = [stage for stage in all_stages if stage.name != TRANSMIT]
 
     def run(plan: ShadowPlan, i: int) -> ShadowMask:
         # Stage by stage: those that a setting does not change are compiled, and run, as they are.
@@ -204,7 +229,23 @@ def cast_counted(config: Configuration, inputs: FrameInputs) -> tuple[list[CastS
 
     frames = [receiving(task) for task in tasks]
     plan, masks = fitted_to_all(config.technique, shadow_plan(config), frames, run=run)
-    return [on_host(mask, plan, frame) for mask, frame in zip(masks, frames, strict=True)], shadow_sizes(plan)
+    opaque = [on_host(mask, plan, frame) for mask, frame in zip(masks, frames, strict=True)]
+    if tasks[0].alpha is None:
+        return CastFrame(opaque, shadow_sizes(plan), [], [], ())
+    transmit = all_stages[-1]
+    cast = [CastMask(mask.shadowed, mask.overflowed) for mask in masks]
+    left: dict[int, CastMask] = {}
+
+    def run_alpha(plan: ShadowPlan, i: int) -> ShadowMask:
+        program = stage_program(transmit, transmit.narrowed(Plan(alpha=plan)))
+        left[i], mask = program([tasks[i]], [cast[i]])[0]
+        return mask
+
+    alpha_frames = [alpha_receiving(task, mask.shadowed) for task, mask in zip(tasks, cast, strict=True)]
+    own, alpha_masks = fitted_to_all(config.technique, alpha_plan(config), alpha_frames, run=run_alpha)
+    alpha = [on_host(mask, own, frame) for mask, frame in zip(alpha_masks, alpha_frames, strict=True)]
+    channels = [image_on_host(left[i].transmittance, inputs) for i in range(len(tasks))]
+    return CastFrame(opaque, shadow_sizes(plan), alpha, channels, shadow_sizes(own))
 
 
 def is_listed(config: Configuration) -> bool:
@@ -223,5 +264,5 @@ def render(config: Configuration, inputs: FrameInputs) -> np.ndarray:
 
 
 def image_on_host(image: tuple[Any, ...], inputs: FrameInputs) -> np.ndarray:
-    """`[h, w, 3]` from the device's runs."""
+    """`[h, w, channels]` from the device's runs."""
     return np.stack([from_runs(np.asarray(channel), inputs.viewport) for channel in image], axis=-1)

@@ -101,6 +101,7 @@ class FrameCounts:
             "scalars": np.array([self.n_solid_blocks, self.light_runs, self.branching, *sizes], np.int64),
             "walked": np.array(self.walked),
             "walk_rows": np.array(self.walk_rows, np.int64),
+            "alpha_sizes": np.array(self.sizes.alpha, np.int64),
         }
 
     @classmethod
@@ -108,7 +109,7 @@ class FrameCounts:
         technique = {str(name): int(value) for name, value in zip(arrays["names"], arrays["counts"], strict=True)}
         walk_rows = tuple(int(rows) for rows in arrays["walk_rows"])
         n_solid_blocks, light_runs, branching, cells, blocks, pairs, *shadow = (int(v) for v in arrays["scalars"])
-        sizes = Sizes(cells, blocks, pairs, tuple(shadow))
+        sizes = Sizes(cells, blocks, pairs, tuple(shadow), tuple(int(v) for v in arrays["alpha_sizes"]))
         walked: Walked = str(arrays["walked"])  # type: ignore[assignment]
         return cls(technique, arrays["of_block"], n_solid_blocks, walked, walk_rows, light_runs, branching, sizes)
 
@@ -168,12 +169,13 @@ def _count_shadowed(config: Configuration, inputs: FrameInputs, sizes: Sizes | N
     suns = inputs.shadows.scene.suns.n_lights
     counts["lighting_computations"] += suns * counts["samples"]
     counts["shadow_lights"] = len(inputs.shadows.lights)
-    shadow: tuple[int, ...] = ()
+    sizes = shading.sizes
     if config.technique not in SHADOW_REFERENCES:
-        cast, shadow = cast_counted(config, inputs)
-        own = shadows_counts([each.counts for each in cast])
+        cast = cast_counted(config, inputs)
+        own = shadows_counts([each.counts for each in cast.opaque], [each.counts for each in cast.alpha])
         counts |= own | {"memory": counts["memory"] + own["memory"]}
-    return replace(shading, technique=counts, sizes=replace(shading.sizes, shadow=shadow)), lengths
+        sizes = replace(sizes, shadow=cast.sizes, alpha=cast.alpha_sizes)
+    return replace(shading, technique=counts, sizes=sizes), lengths
 
 
 def _published_counts(config: Configuration, env: dict[str, Any], inputs: FrameInputs) -> AssignCounts:

@@ -134,7 +134,7 @@ class FrameInputs:
         if technique.casts_shadows:
             env["shadow_slots"] = self.shadows.slots
             if config.technique in SHADOW_REFERENCES:
-                env["shadow_merge"] = self.shadows.reference_masks(config)
+                env["shadow_masks"] = self.shadows.reference_masks(config)
             else:
                 env["shadow_tasks"] = self.shadows.tasks(config)
         return env

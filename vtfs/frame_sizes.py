@@ -19,20 +19,28 @@ class Sizes:
 
     - `cells`: of the grid's page table; `blocks`: of clusters and of their blocks; `pairs`: of the
       (cluster, light) pairs and of every level on the way to them.
-    - `shadow`: of shadow techniques, see `shadow_sizes`.
+    - `shadow`: of shadow techniques, see `shadow_sizes`; `alpha`: the same of alpha casters, empty where none cast.
     """
 
     cells: int
     blocks: int
     pairs: int
     shadow: tuple[int, ...] = ()
+    alpha: tuple[int, ...] = ()
 
     def covering(self, other: Sizes) -> Sizes:
         """What holds both; of the same technique and plan."""
-        shadow = self.shadow or other.shadow
-        if self.shadow and other.shadow:
-            shadow = tuple(map(max, self.shadow, other.shadow))
-        return Sizes(max(self.cells, other.cells), max(self.blocks, other.blocks), max(self.pairs, other.pairs), shadow)
+        return Sizes(
+            max(self.cells, other.cells),
+            max(self.blocks, other.blocks),
+            max(self.pairs, other.pairs),
+            _covering(self.shadow, other.shadow),
+            _covering(self.alpha, other.alpha),
+        )
+
+
+def _covering(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(map(max, a, b)) if a and b else a or b
 
 
 NO_SIZES = Sizes(0, 0, 0)

@@ -175,6 +175,14 @@ PARAMETERS: dict[str, Parameter] = {
             choices=("cast", "culled"),
         ),
         Parameter(
+            "blending",
+            "grey",
+            "what alpha-masked and blended triangles do to light: masked ones cast where they are opaque, blended ones "
+            "stop the share alpha (grey), let what their alpha covers through in their colour (coloured), or stop all "
+            "light of a sample with the chance alpha (stochastic); or only opaque triangles cast",
+            choices=("grey", "coloured", "stochastic", "opaque"),
+        ),
+        Parameter(
             "feedback",
             "on",
             "triangles go on only into nodes that no other one has shadowed as a whole",
@@ -213,8 +221,8 @@ _SHADING = ("gbuffer", "light_cutoff")
 _BRUTE_FORCE = ("assigner", "batch", *_CLUSTERS, *_SHADING, "approximate")
 _TREE = ("branching", "resort_every", "assigner")
 _BY_TREE = (*_TILES, *_SLICES, *_TREE, "batch", *_CLUSTERS, "leaf_test", *_SHADING, "approximate")
-_VOLUMES = ("tile_px", "branching", "batch", "planes", "feedback", "passes", "level", "front_faces")
-_STENCIL = ("tile_px", "branching", "stencil", "front_faces")
+_VOLUMES = ("tile_px", "branching", "batch", "planes", "feedback", "passes", "level", "front_faces", "blending")
+_STENCIL = ("tile_px", "branching", "stencil", "front_faces", "blending")
 
 ACCURACY = ("gbuffer", "light_cutoff", "approximate", "front_faces", "stencil", "around_eye")
 """Parameters that change the image: their defaults are exact."""
@@ -234,13 +242,16 @@ TECHNIQUES: dict[str, tuple[str, ...]] = {
     "z_fail": (*_STENCIL, *_SHADING),
     "ptsv": (*_VOLUMES, *_SHADING),
     "cluster_hierarchy": ("tile_px", "depth_slices", "bounds", "tree", *_VOLUMES[1:], *_SHADING),
-    "shadow_rays": ("front_faces", *_SHADING),
-    "brute_force": ("front_faces", *_SHADING),
+    "shadow_rays": ("front_faces", "blending", *_SHADING),
+    "brute_force": ("front_faces", "blending", *_SHADING),
 }
 """Techniques and the parameters each one has, in the order in which they are shown."""
 
 SHADOW_NAMES = ("z_pass", "z_fail", "ptsv", "cluster_hierarchy", "shadow_rays", "brute_force")
 """Those that find which samples lie in the shadow of which light, and then shade by `LISTS_OF_SHADOWED`."""
+
+STENCIL_NAMES = ("z_pass", "z_fail")
+"""Those that cannot cast by alpha-masked and blended triangles: a stencil cannot tell surfaces apart."""
 
 SHADOW_REFERENCES = ("shadow_rays", "brute_force")
 """What the others are checked against; they run on the host."""

@@ -23,11 +23,13 @@ class ViewShadows:
 
     - `slot`: of each light, which of the masks is its shadow, -1 for none; the directional lights have the first ones.
     - `masks`: samples in shadow, bool `[slots, h, w]`.
+    - `transmittance`: what is left of each light elsewhere, `[slots, h, w, channels]` of one or three; None: all.
     """
 
     slot: np.ndarray
     masks: np.ndarray
     suns: DirectionalLights
+    transmittance: np.ndarray | None = None
 
 
 def forward_reference(
@@ -107,9 +109,16 @@ def _shade(
     cone = ((along - view.cos_outer[light]) / (view.cos_inner - view.cos_outer)[light]).clip(0, 1)
     lit = cone * window / np.maximum(distance2, _MIN_DISTANCE2_M2) * np.einsum("cp,cp->p", n, to_unit)
     gloss = specular[sample] * n_dot_h ** shininess[sample]
+    left = np.ones((len(sample), 1))
+    if shadows is not None and shadows.transmittance is not None:
+        slot, of_box = shadows.slot[light], shadows.transmittance[(slice(None), *box)][:, valid]
+        left = np.where((slot >= 0)[:, None], of_box[np.maximum(slot, 0), sample], 1.0)
+    left = np.broadcast_to(left, (len(sample), 3))
     colour = emissive + np.stack(
         [
-            np.bincount(sample, lit * view.colour[light, c] * (base[sample, c] + gloss), minlength=len(position))
+            np.bincount(
+                sample, lit * left[:, c] * view.colour[light, c] * (base[sample, c] + gloss), minlength=len(position)
+            )
             for c in range(3)
         ],
         axis=1,
@@ -117,11 +126,12 @@ def _shade(
     if shadows is None:
         return colour
     rotation = samples.camera.view_from_world[:3, :3]
-    for toward, sun, mask in zip(shadows.suns.toward, shadows.suns.colour, shadows.masks, strict=False):
+    for k, (toward, sun, mask) in enumerate(zip(shadows.suns.toward, shadows.suns.colour, shadows.masks, strict=False)):
         to_unit = np.broadcast_to((rotation @ toward)[:, None], normal.T.shape)
         n_dot_h = _highlight(to_unit, normal.T, from_eye.T)
         lit = np.where(mask[box][valid], 0, np.maximum((normal.T * to_unit).sum(axis=0), 0))
-        colour += lit[:, None] * sun * (base + (specular * n_dot_h**shininess)[:, None])
+        left_of_sun = 1.0 if shadows.transmittance is None else shadows.transmittance[(k, *box)][valid]
+        colour += left_of_sun * lit[:, None] * sun * (base + (specular * n_dot_h**shininess)[:, None])
     return colour
 
 

@@ -110,7 +110,9 @@ class SceneSetup:
         """
         from vtfs.shadow_inputs import shadow_scene
 
-        return shadow_scene(self.scene, self.suns, self._options.shadow_lights) if self.scene is not None else None
+        if self.scene is None:
+            return None
+        return shadow_scene(self.scene, self.suns, self._options.shadow_lights, self._options.seed)
 
     @property
     def bounds_m(self) -> tuple[np.ndarray, np.ndarray]:

@@ -120,7 +120,8 @@ def reflected_suns(surface: Surface, shadows: LightShadows) -> tuple[Float[Array
         row = shadows.slots.sun_row[sun]
         n_dot_to, gloss = _facing(surface, (row[0], row[1], row[2]), 1.0)
         lit = jnp.where(shadows.sun_lit(sun), n_dot_to, 0)
-        return tuple(s + lit * row[3 + c] * (surface.base_colour[c] + gloss) for c, s in enumerate(sums))
+        added = tuple(lit * row[3 + c] * (base + gloss) for c, base in enumerate(surface.base_colour))
+        return tuple(s + a for s, a in zip(sums, shadows.sun_left(sun, added), strict=True))
 
     black = tuple(jnp.zeros_like(channel) for channel in surface.base_colour)
     n_suns = shadows.slots.sun_row.shape[0]
@@ -211,7 +212,8 @@ def shade(
     **Arguments:**
 
     - `transparent`: shade the transparent runs, and return those; else the solid ones, and return the visible.
-    - `shadows`: a light adds nothing where a sample lies in its shadow, and directional lights shine too.
+    - `shadows`: a light adds nothing where a sample lies in its shadow, and what alpha casters leave of it elsewhere;
+      directional lights shine too.
     - `cluster_light`: what is not on the lists but adds to all samples of a cluster.
     """
     capacity = clusters.block_run.shape[0]
@@ -245,6 +247,8 @@ def shade(
             # Narrow channels are widened here and not before the loop: they are read at every step.
             widened = jax.tree.map(lambda channel: channel.astype(jnp.float32), surface)
             added = reflected(widened, light, light_cutoff, listed)
+            if shade_of is not None:
+                added = shade_of.left_of(index, added)
             return k + 1, tuple(s + a for s, a in zip(sums, added, strict=True))
 
         first_sums = tuple(s[:width] for s in sums)

@@ -10,16 +10,26 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, UInt32
 
+from vtfs.alpha_casters import (
+    AlphaCasters,
+    AlphaSurfaces,
+    Blending,
+    Casting,
+    SceneCasters,
+    alpha_on_device,
+    scene_bias_m,
+    scene_casters,
+)
 from vtfs.directional_lights import DirectionalLights
 from vtfs.gbuffer import Fragments, to_runs
 from vtfs.input_error import InputError
 from vtfs.layers import Layers
 from vtfs.light_shadows import MAX_SHADOW_LIGHTS, CastMask, ShadowSlots
 from vtfs.lights import Lights
-from vtfs.parameters import Configuration
-from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, opaque_casters
+from vtfs.parameters import STENCIL_NAMES, Configuration
+from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight
 from vtfs.shadow_mask import (
     CastersOnDevice,
     ShadowFrame,
@@ -31,6 +41,7 @@ from vtfs.shadow_mask import (
 from vtfs.shadow_references import ShadowRays, brute_force, kept_casters, view_points_m
 from vtfs.shadow_techniques import grid_of
 from vtfs.shadow_volumes.volumes import rotated
+from vtfs.transmittance_references import brute_force_transmittance
 
 if TYPE_CHECKING:
     from vtfs.scene import Scene
@@ -44,12 +55,16 @@ _RANKED_SAMPLES = 4096
 class ShadowScene:
     """What casts shadows in a scene.
 
+    - `casters`: opaque ones; `alpha`: the others, on the same vertices, None where there are none.
     - `n_lights`: lights with a place that cast on each frame: those that light it most. Directional ones all do.
+    - `seed`: of stochastic blending.
     """
 
     casters: Casters
     suns: DirectionalLights
     n_lights: int
+    alpha: AlphaCasters | None = None
+    seed: int = 0
 
     def __post_init__(self):
         if not 0 <= self.n_lights <= MAX_SHADOW_LIGHTS - self.suns.n_lights:
@@ -63,13 +78,49 @@ class ShadowScene:
         return casters_on_device(self.casters)
 
     @cached_property
+    def alpha_on_device(self) -> tuple[CastersOnDevice, AlphaSurfaces]:
+        assert self.alpha is not None
+        return casters_on_device(self.alpha.casters), alpha_on_device(self.alpha)
+
+    @cached_property
+    def bias_m(self) -> float:
+        """By which samples move toward the light: a share of the extent of all casters."""
+        return (
+            default_bias_m(self.casters) if self.alpha is None else scene_bias_m(SceneCasters(self.casters, self.alpha))
+        )
+
+    def blending(self, config: Configuration) -> Casting:
+        """What alpha casters do to light; `opaque` also where there are none.
+
+        **Raises:** `InputError` where there are, and the technique cannot cast by them.
+        """
+        casting: Casting = config["blending"] if self.alpha is not None else "opaque"  # type: ignore[assignment]
+        if casting != "opaque" and config.technique in STENCIL_NAMES:
+            raise InputError(
+                f"technique `{config.technique}`: a stencil cannot cast by this scene's alpha-masked and blended "
+                "triangles; use ptsv or cluster_hierarchy, or blending=opaque, with which only opaque ones cast."
+            )
+        return casting
+
+    @cached_property
     def rays(self) -> ShadowRays:
         return ShadowRays(self.casters)
 
 
-def shadow_scene(scene: Scene, suns: DirectionalLights, n_lights: int) -> ShadowScene:
-    """Of a scene with materials: its opaque triangles cast."""
-    return ShadowScene(opaque_casters(scene), suns, n_lights)
+def shadow_scene(scene: Scene, suns: DirectionalLights, n_lights: int, seed: int = 0) -> ShadowScene:
+    """Of a scene with materials: all its triangles cast."""
+    casters = scene_casters(scene)
+    return ShadowScene(
+        casters.opaque, suns, n_lights, casters.alpha if casters.alpha.casters.n_triangles else None, seed
+    )
+
+
+class AlphaTask(eqx.Module):
+    """What alpha casters of one light on one view are; `stream`: of random bits, see `transmit`."""
+
+    casters: CastersOnDevice
+    surfaces: AlphaSurfaces
+    stream: UInt32[Array, " 2"]
 
 
 class ShadowTask(eqx.Module):
@@ -77,11 +128,13 @@ class ShadowTask(eqx.Module):
 
     - `frame`: which samples receive shadow is not known yet: all that are valid do.
     - `range_m`: beyond it the light lights nothing; infinite for a directional one.
+    - `alpha`: None where no alpha casters cast.
     """
 
     frame: ShadowFrame
     normal: tuple[Float[Array, "runs 32"], ...]
     range_m: Float[Array, ""]
+    alpha: AlphaTask | None = None
 
 
 def with_receivers(task: ShadowTask) -> ShadowFrame:
@@ -96,6 +149,20 @@ def with_receivers(task: ShadowTask) -> ShadowFrame:
     if not frame.directional:
         faces &= sum(t * t for t in to) < task.range_m * task.range_m
     return eqx.tree_at(lambda f: f.receives, frame, frame.receives & faces)
+
+
+def alpha_frame(task: ShadowTask, shadowed: Bool[Array, "runs 32"]) -> ShadowFrame:
+    """What alpha casters start from: samples that opaque ones leave lit. Inside of `jax.enable_x64(True)`."""
+    assert task.alpha is not None
+    frame, casters = with_receivers(task), task.alpha.casters
+    return replace(
+        frame,
+        receives=frame.receives & ~shadowed,
+        vertex_m=casters.vertex_m,
+        triangles=casters.triangles,
+        edges=casters.edges,
+        culls_front=jnp.bool_(False),  # panes and leaves are not closed
+    )
 
 
 def brightest_lights(samples: ViewSamples, lights: Lights, n: int) -> np.ndarray:
@@ -155,7 +222,7 @@ class FrameShadows:
 
     @cached_property
     def bias_m(self) -> float:
-        return default_bias_m(self.scene.casters)
+        return self.scene.bias_m
 
     @cached_property
     def _deepest_m(self) -> float:
@@ -169,28 +236,71 @@ class FrameShadows:
         positions = [own.positions() for own in fragments]
         return tuple((own, part.gbuffer(own, "float32").normal) for part, own in zip(fragments, positions, strict=True))
 
+    def blending(self, config: Configuration) -> Casting:
+        return self.scene.blending(config)
+
+    def _alpha_task(self, casting: Casting, view: int, slot: int) -> AlphaTask | None:
+        if casting == "opaque":
+            return None
+        stream = np.array(self.stream(view, slot), np.uint32)
+        return AlphaTask(*self.scene.alpha_on_device, jax.device_put(stream))
+
+    def stream(self, view: int, slot: int) -> tuple[int, int]:
+        """Of random bits: every view and light has its own."""
+        return self.scene.seed % 2**32, view * MAX_SHADOW_LIGHTS + slot
+
     def tasks(self, config: Configuration) -> list[ShadowTask]:
-        """For each view the tasks of all slots."""
+        """For each view the tasks of all slots.
+
+        **Raises:** `InputError`, see `blending`.
+        """
+        casting = self.blending(config)
         params = config.params
         camera = self.views[0].camera
         grid = grid_of(camera, self._deepest_m, int(params["tile_px"]), int(params.get("depth_slices", 0)))
         front_faces: FrontFaces = params["front_faces"]  # type: ignore[assignment]
         tasks = []
-        for view, (positions, normal) in zip(self.views, self._on_device, strict=True):
-            for light, range_m in zip(self.lights, self.range_m, strict=True):
+        for v, (view, (positions, normal)) in enumerate(zip(self.views, self._on_device, strict=True)):
+            for k, (light, range_m) in enumerate(zip(self.lights, self.range_m, strict=True)):
                 frame = shadow_frame(view, self.scene.on_device, light, grid, self.bias_m, None, front_faces, positions)
-                tasks.append(ShadowTask(frame, normal, jax.device_put(np.float32(range_m))))
+                alpha = self._alpha_task(casting, v, k)
+                tasks.append(ShadowTask(frame, normal, jax.device_put(np.float32(range_m)), alpha))
         return tasks
 
     def reference_masks(self, config: Configuration) -> list[CastMask]:
         """Masks of a reference technique, in the order of `tasks`, in runs."""
         front_faces: FrontFaces = config["front_faces"]  # type: ignore[assignment]
+        casting = self.blending(config)
         masks = []
-        for view in self.views:
+        for v, view in enumerate(self.views):
             for k in range(len(self.lights)):
                 mask = self.reference(view, k, config.technique, front_faces)
-                masks.append(CastMask(jax.device_put(to_runs(mask)), jax.device_put(np.bool_(False))))
+                left: tuple[np.ndarray, ...] = ()
+                if casting != "opaque":
+                    lit = self.lit_by(view, k) & ~mask
+                    left = tuple(np.moveaxis(self.reference_light(v, k, lit, casting)[0], -1, 0))
+                channels = tuple(jax.device_put(to_runs(channel.astype(np.float32))) for channel in left)
+                masks.append(CastMask(jax.device_put(to_runs(mask)), jax.device_put(np.bool_(False)), channels))
         return masks
+
+    def reference_light(self, v: int, k: int, some: np.ndarray, blending: Blending) -> tuple[np.ndarray, np.ndarray]:
+        """What alpha casters leave of the light of a slot on some samples `[h, w]` of a view, in float64.
+
+        **Returns:** `[h, w, channels]`, one or three, 1 on the other samples; and `[h, w]` the distance of the nearest
+        decision from its threshold, see `ReferenceLight`.
+        """
+        assert self.scene.alpha is not None
+        view = self.views[v]
+        points, eye_m = view_points_m(view, some), np.array(view.camera.eye_m)
+        pixel, stream = np.flatnonzero(some.ravel()), self.stream(v, k)
+        found = brute_force_transmittance(
+            points, self.scene.alpha, self.lights[k], self.bias_m, eye_m, blending, pixel, stream
+        )
+        left = np.ones((*some.shape, 3 if blending == "coloured" else 1))
+        left[some] = found.transmittance.reshape(len(points), left.shape[-1])
+        margin = np.full(some.shape, np.inf)
+        margin[some] = found.cutoff_margin
+        return left, margin
 
     def lit_by(self, view: ViewSamples, k: int) -> np.ndarray:
         """Samples of a view that the light of a slot would light: bool `[h, w]`, in float64."""
@@ -231,3 +341,14 @@ def receiving(task: ShadowTask) -> ShadowFrame:
     """`with_receivers`, as a program of its own."""
     with jax.enable_x64(True):
         return _receiving(task)
+
+
+@jax.jit
+def _alpha_frame(task: ShadowTask, shadowed: Bool[Array, "runs 32"]) -> ShadowFrame:
+    return alpha_frame(task, shadowed)
+
+
+def alpha_receiving(task: ShadowTask, shadowed: Bool[Array, "runs 32"]) -> ShadowFrame:
+    """`alpha_frame`, as a program of its own."""
+    with jax.enable_x64(True):
+        return _alpha_frame(task, shadowed)

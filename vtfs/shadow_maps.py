@@ -17,7 +17,7 @@ from vtfs.techniques import REGISTRY
 class ShadowMaps:
     """Of the visible solid samples, int `[h, w]`, summed over the lights that cast.
 
-    - `lit`: lights that would light each sample; `shadowed`: those of them in whose shadow it lies.
+    - `lit`: lights that would light each sample; `shadowed`: those of them that do not reach it at all.
     - `tests`: triangles that its tile or cluster is tested against; of references 0.
     """
 
@@ -34,7 +34,13 @@ def shadow_maps(config: Configuration, inputs: FrameInputs) -> ShadowMaps | None
     solid, n_slots = shadows.views[0], len(shadows.lights)
     lit = np.sum([shadows.lit_by(solid, k) for k in range(n_slots)], axis=0)
     if config.technique in SHADOW_REFERENCES:
-        masks = [from_runs(np.asarray(m.shadowed), inputs.viewport) for m in shadows.reference_masks(config)[:n_slots]]
+        masks = []
+        for mask in shadows.reference_masks(config)[:n_slots]:
+            stopped = np.all([np.asarray(c) == 0 for c in mask.transmittance], axis=0) if mask.transmittance else False
+            masks.append(from_runs(np.asarray(mask.shadowed) | stopped, inputs.viewport))
         return ShadowMaps(lit, np.sum(masks, axis=0), np.zeros_like(lit))
-    cast = cast_counted(config, inputs)[0][:n_slots]
-    return ShadowMaps(lit, np.sum([c.shadowed for c in cast], axis=0), np.sum([c.tests for c in cast], axis=0))
+    cast = cast_counted(config, inputs)
+    opaque, alpha = cast.opaque[:n_slots], cast.alpha[:n_slots]
+    # Of no sample both: alpha casters are tested on what opaque ones leave lit.
+    shadowed = [each.shadowed for each in (*opaque, *alpha)]
+    return ShadowMaps(lit, np.sum(shadowed, axis=0), np.sum([each.tests for each in (*opaque, *alpha)], axis=0))

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from vtfs.alpha_casters import Casting
 from vtfs.cluster_grid import ClusterGrid
 from vtfs.gbuffer import Fragments, Positions, to_runs
 from vtfs.layers import Layers
@@ -65,6 +66,7 @@ class ShadowPlan:
       volumes
       around the eye, without which it fails where the camera stands in one.
     - `precision`: in which samples are tested against planes. float32 leaks at vertices: it is there to show that.
+    - `blending`: what alpha casters do to light; `opaque`: they cast nothing.
     - `clusters`, `groups`, `leaf_groups`, `pairs`, `cells`: rounded capacities: of clusters and their blocks, of the
       lists of a level, of the lists of tiles or clusters, of what goes on to a second pass, of the full tree.
     - `level_groups`: capacities of each level's lists. Then levels are unrolled and nothing loops, which suits a GPU;
@@ -83,6 +85,7 @@ class ShadowPlan:
     stencil: Stencil = "unlimited"
     around_eye: bool = True
     precision: Precision = "float64"
+    blending: Casting = "opaque"
     clusters: int = 0
     groups: int = 0
     leaf_groups: int = 0

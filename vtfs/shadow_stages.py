@@ -8,9 +8,13 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-from vtfs.shadow_inputs import ShadowTask, with_receivers
+import jax.numpy as jnp
+
+from vtfs.light_shadows import CastMask
+from vtfs.shadow_inputs import ShadowTask, alpha_frame, with_receivers
 from vtfs.shadow_mask import ShadowMask, ShadowPlan
 from vtfs.shadow_volumes import cluster_hierarchy, ptsv, stencil
+from vtfs.shadow_volumes.transmittance import transmit
 
 _FAILING = {"z_pass": False, "z_fail": True}
 
@@ -21,12 +25,14 @@ class CastingStage:
 
     - `needs`: `shadow_tasks` and earlier stages.
     - `depends_on`: the fields of `ShadowPlan` that its program depends on, besides capacities; the others keep it.
+    - `of_alpha`: it runs only where alpha casters cast, by the plan and the capacities of those.
     """
 
     name: str
     run: Callable[..., Any]
     needs: tuple[str, ...]
     depends_on: tuple[str, ...]
+    of_alpha: bool = False
 
     def narrowed(self, plan: ShadowPlan) -> ShadowPlan:
         """The plan with only what the stage depends on, so that nothing else compiles it again."""
@@ -37,7 +43,22 @@ _CAPACITIES = ("clusters", "groups", "leaf_groups", "pairs", "cells", "level_gro
 _WALKED = ("branching", "extra", "feedback", "batch", "passes", "level", *_CAPACITIES)
 
 
+TRANSMIT = "shadow_transmit"
+
+
 def casting_stages(technique: str) -> tuple[CastingStage, ...]:
+    """The stages of opaque casters, and of techniques that have it the one of alpha casters."""
+    if technique in _FAILING:
+        return _opaque_stages(technique)
+    of_plan = ("tile_px", "bounds", "extra", "tree", "blending", *_WALKED)
+    needs = ("shadow_tasks", "shadow_merge")
+    alpha = CastingStage(
+        TRANSMIT, functools.partial(_transmit, technique), needs, tuple(dict.fromkeys(of_plan)), of_alpha=True
+    )
+    return (*_opaque_stages(technique), alpha)
+
+
+def _opaque_stages(technique: str) -> tuple[CastingStage, ...]:
     """Planes of all volumes, the tree over what receives shadow, the walk down it, and the mask."""
     by_failing = _FAILING.get(technique)
     module: ModuleType = (
@@ -77,3 +98,15 @@ def _merge(
 ) -> ShadowMask:
     of_stencil = (plan,) if variant else ()
     return module.shadow_merge(planes, hierarchy, walk, *of_stencil, **variant)
+
+
+def _transmit(
+    technique: str, plan: ShadowPlan, task: ShadowTask, opaque: ShadowMask | CastMask
+) -> tuple[CastMask, ShadowMask]:
+    """What alpha casters leave on the samples that opaque ones leave lit, and what it took."""
+    assert task.alpha is not None and plan.blending != "opaque"
+    found = transmit(
+        technique, alpha_frame(task, opaque.shadowed), task.alpha.surfaces, task.alpha.stream, plan, plan.blending
+    )
+    left = found.transmittance or (jnp.where(found.mask.shadowed, 0, 1).astype(jnp.float32),)
+    return CastMask(opaque.shadowed, opaque.overflowed | found.mask.overflowed, left), found.mask

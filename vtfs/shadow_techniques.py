@@ -70,6 +70,13 @@ def shadow_plan(config: Configuration) -> ShadowPlan:
     )
 
 
+def alpha_plan(config: Configuration) -> ShadowPlan:
+    """The same for alpha casters. No node is accepted and no sample is finished by one of them, so that batches,
+    feedback and a second pass would change nothing but the order."""
+    once = replace(shadow_plan(config), feedback=False, batch=0, passes=1, level=0)
+    return replace(once, blending=config["blending"])  # type: ignore[arg-type]
+
+
 def shadow_sizes(plan: ShadowPlan) -> tuple[int, ...]:
     """The capacities of a plan, as numbers of which the larger one holds more."""
     return plan.clusters, plan.groups, plan.leaf_groups, plan.pairs, plan.cells, *plan.level_groups
@@ -352,18 +359,46 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
     }
 
 
-def shadows_counts(of_each: Sequence[dict[str, int]]) -> dict[str, int]:
+_OF_ALPHA = {
+    "samples": "alpha_samples",
+    "casters": "alpha_casters",
+    "items": "alpha_clusters",
+    "node_tests": "alpha_node_tests",
+    "sample_tests": "alpha_sample_tests",
+    "listed_pairs": "alpha_listed_pairs",
+    "longest_list": "longest_alpha_list",
+}
+
+
+def shadows_counts(of_each: Sequence[dict[str, int]], of_alpha: Sequence[dict[str, int]] = ()) -> dict[str, int]:
     """Counts of the shadows of several lights and views: sums, but what is held or longest is that of the largest.
 
     Names that shading has too are told apart: `shadow_samples` receive shadow, `shadow_clusters` are what is walked.
+
+    **Arguments:**
+
+    - `of_alpha`: of alpha casters, on what opaque ones leave lit: their tests are part of `test_and_set` and
+      `test_and_set_in_cluster`, and besides that stand apart, as `alpha_node_tests` and the like.
     """
+    both = _shadows_counts(of_each)
+    if of_alpha:
+        alpha = _shadows_counts(of_alpha)
+        for name in ("test_and_set", "test_and_set_in_cluster", "memory"):
+            both[name] += alpha[name]
+        both |= {own: alpha[_SHADOW_NAMES.get(name, name)] for name, own in _OF_ALPHA.items()}
+    return both
+
+
+_SHADOW_NAMES = {"samples": "shadow_samples", "items": "shadow_clusters", "longest_list": "longest_shadow_list"}
+
+
+def _shadows_counts(of_each: Sequence[dict[str, int]]) -> dict[str, int]:
     largest = {"memory", "longest_list", "casters"}
     total = {
         name: (max if name in largest else sum)(counts.get(name, 0) for counts in of_each)
         for name in dict.fromkeys(name for counts in of_each for name in counts)
     }
-    names = {"samples": "shadow_samples", "items": "shadow_clusters", "longest_list": "longest_shadow_list"}
-    return {names.get(name, name): value for name, value in total.items()}
+    return {_SHADOW_NAMES.get(name, name): value for name, value in total.items()}
 
 
 def _memory(plan: ShadowPlan, frame: ShadowFrame) -> int:

@@ -43,7 +43,7 @@ from vtfs.parameters import (
 )
 from vtfs.shading import ClusterLight, Image, blend_layers, chunk_blocks, shade
 from vtfs.shadow_mask import ShadowPlan
-from vtfs.shadow_stages import CastingStage, casting_stages
+from vtfs.shadow_stages import TRANSMIT, CastingStage, casting_stages
 from vtfs.shadow_techniques import shadow_plan
 
 _TESTS_AT_ONCE = {"cpu": 2**19, "gpu": 2**22}
@@ -70,7 +70,7 @@ class Plan:
     - `approximates`: lights that vary little over a cluster are evaluated once for it.
     - `assigner`: `published` also where `auto` has no choice.
     - `cells`, `blocks`, `pairs`: rounded capacities (see `frame.Sizes`).
-    - `shadow`: of shadow techniques, with capacities of its own.
+    - `shadow`: of shadow techniques, with capacities of its own; `alpha`: of alpha casters, where any cast.
     """
 
     bounds: Bounds = "implicit"
@@ -89,6 +89,7 @@ class Plan:
     blocks: int = 0
     pairs: int = 0
     shadow: ShadowPlan | None = None
+    alpha: ShadowPlan | None = None
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,8 @@ class Stage:
     - `needs`: inputs (`positions`, `gbuffer`, `layers`, `grid`, `normals`, `lights`, `light_cutoff`, `approximate`, for
       kept orders `old_order`, `frame`, `resort_every`, of shadow techniques `shadow_tasks` and `shadow_slots`) and
       earlier stages. `listed` are the lists as assigned, `assign` those without what is evaluated once a cluster, and
-      `cluster_light` is that, or None.
+      `cluster_light` is that, or None. `shadow_masks` are those of
+      `shadow_merge`, with what alpha casters leave where there are any.
     - `statics`: the fields of `Plan` that its program depends on.
     - `casting`: it runs once for each light that casts and each view, in float64: what it needs and its results are
       lists.
@@ -112,8 +114,9 @@ class Stage:
 
     def narrowed(self, plan: Plan) -> Plan:
         """The plan with only what the stage's program depends on, so that nothing else compiles it again."""
-        if self.casting and plan.shadow:
-            return Plan(shadow=self.casting.narrowed(plan.shadow))
+        own = plan.alpha if self.casting and self.casting.of_alpha else plan.shadow
+        if self.casting and own:
+            return Plan(shadow=self.casting.narrowed(own))
         return Plan(**{name: getattr(plan, name) for name in self.statics})
 
 
@@ -178,7 +181,7 @@ class Technique:
         """
         stages = self.stages if plan.assigner == "published" else _without_tree(self.stages)
         left_out = {"shade_transparent": not has_transparent, "approximate": not plan.approximates}
-        left_out |= dict.fromkeys(("reduce", "morton"), plan.keeps_order)
+        left_out |= dict.fromkeys(("reduce", "morton"), plan.keeps_order) | {TRANSMIT: plan.alpha is None}
         stages = (_SORT_OR_KEEP if stage is _SORT and plan.keeps_order else stage for stage in stages)
         return tuple(stage for stage in stages if not left_out.get(stage.name, False))
 
@@ -420,7 +423,7 @@ def _deferred(name: str, stencil: bool) -> Technique:
     return Technique(name, stages, lists="light_volumes", reads_gbuffer="per_light")
 
 
-_SHADOW_BITS = Stage("shadow_bits", _shadow_bits, ("shadow_merge", "shadow_slots", "layers"))
+_SHADOW_BITS = Stage("shadow_bits", _shadow_bits, ("shadow_masks", "shadow_slots", "layers"))
 _SHADOWED = ("clusters", "assign", "cluster_light", "shadow_bits")
 _SHADE_SHADOWED = (
     Stage("shade_opaque", _shade, ("gbuffer", *_LIGHTS, *_SHADOWED), ("batch",)),

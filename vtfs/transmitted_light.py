@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, UInt32
 
-from vtfs.alpha_casters import AlphaSurfaces, Blending, SceneCasters, alpha_on_device
+from vtfs.alpha_casters import AlphaSurfaces, Blending, SceneCasters, alpha_on_device, scene_bias_m
 from vtfs.gbuffer import Fragments, from_runs
 from vtfs.input_error import InputError
-from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight
+from vtfs.shadow_casters import FrontFaces, ShadowLight
 from vtfs.shadow_mask import ShadowFrame, ShadowPlan, casters_on_device, shadow_frame
 from vtfs.shadow_techniques import CastShadows, cast_shadows, fitted_to_all, on_host, shadow_grid
 from vtfs.shadow_volumes.transmittance import Transmitted, transmit
@@ -41,12 +41,6 @@ class TransmittedLight:
     def shadowed(self) -> np.ndarray:
         """Samples that no light reaches, bool `[h, w]`: behind an opaque caster, or one that stops all light there."""
         return self.opaque.shadowed | self.alpha.shadowed
-
-
-def scene_bias_m(casters: SceneCasters) -> float:
-    """The share of the extent of all casters by which samples move toward the light."""
-    both = np.concatenate([casters.opaque.triangles, casters.alpha.casters.triangles])
-    return BIAS * Casters(casters.opaque.vertices_m, both).extent_m
 
 
 @functools.cache

@@ -80,6 +80,7 @@ def test_defaults_are_those_of_the_design():
         "unique": "page_table", "normal_bins": 0, "normal_cones": "implicit", "gbuffer": "float32", "light_cutoff": 0.0,
         "prepass": "on", "approximate": 0.0, "resort_every": 1, "planes": "on", "front_faces": "cast", "feedback": "on",
         "passes": 1, "level": 0, "tree": "compact", "stencil": "unlimited", "around_eye": "on",
+        "blending": "grey",
     }  # fmt: skip
     # Tiles had their samples' depths before there was a choice (Olsson and Assarsson 2011).
     own = {(t, n): default_value(t, n) for t, names in TECHNIQUES.items() for n in names}

@@ -172,7 +172,8 @@ def test_the_registry_and_the_parameters_name_the_same_techniques():
         known = {"positions", "gbuffer", "layers", "grid", "normals", "lights", "light_cutoff"}
         known |= {"approximate", "cluster_light", "listed", "old_order", "frame", "resort_every"}
         if technique.casts_shadows:
-            known |= {"shadow_slots", "shadow_merge" if name in SHADOW_REFERENCES else "shadow_tasks"}
+            known |= {"shadow_slots", "shadow_masks" if name in SHADOW_REFERENCES else "shadow_tasks"}
         for stage in technique.stages:
             assert set(stage.needs) <= known
             known.add(stage.name)
+            known |= {"shadow_masks"} if stage.name == "shadow_merge" else set()

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull
 
 from tests.strategies import SMALL, a_camera, seeds, surface_samples
 from tests.vtfs.test_shadow_mask import CLUSTERS, N_TRIANGLES, N_VERTICES, TILES, light_of, soup
-from vtfs.alpha_casters import AlphaCasters, Blending, alpha_on_device, scene_casters
+from vtfs.alpha_casters import AlphaCasters, Blending, alpha_on_device, scene_bias_m, scene_casters
 from vtfs.camera import Camera, Viewport
 from vtfs.gallery import build_scene
 from vtfs.gbuffer import Fragments, from_runs
@@ -28,7 +28,7 @@ from vtfs.shadow_mask import ShadowPlan, casters_on_device, default_bias_m, faci
 from vtfs.shadow_references import brute_force, classify, view_points_m
 from vtfs.shadow_techniques import shadow_grid
 from vtfs.transmittance_references import brute_force_transmittance
-from vtfs.transmitted_light import alpha_program, in_fragments, scene_bias_m, transmitted_light, views_of
+from vtfs.transmitted_light import alpha_program, in_fragments, transmitted_light, views_of
 from vtfs.view_samples import ViewSamples, trace_view_samples
 
 some = settings(max_examples=4, deadline=None)
