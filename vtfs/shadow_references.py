@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 EDGE_BAND_RAD = 1e-5
 PLANE_BAND_BIASES = 2.0
+_ON_PLANE_BIASES = 0.1
+"""A sample this near to a plane lies on it: float32 positions are off by at most 0.02 biases of 1e-5 of the extent."""
 
 _PAIRS_AT_ONCE = 2**22
 
@@ -162,7 +164,8 @@ class Mismatches:
     """Samples where a mask differs from a reference, by reason.
 
     - `near_edge`: within 1e-5 rad of a caster's edge, seen from the light (directional: 1e-5 of the extent).
-    - `near_plane`: not that, but within twice the bias of the plane of a caster that covers it.
+    - `near_plane`: not that, but within twice the bias of the plane of a caster that covers it and that it does not lie
+      on: a surface that shadows itself is an error.
     - `errors`: neither; `error_points`: their indices.
     """
 
@@ -194,7 +197,7 @@ def classify(
         point = points_m[index]
         if _edge_angle(point, corners, homogeneous, extent_m) <= EDGE_BAND_RAD:
             near_edge += 1
-        elif _plane_distance(point, corners, homogeneous) <= PLANE_BAND_BIASES * bias_m:
+        elif _plane_distance(point, corners, homogeneous, _ON_PLANE_BIASES * bias_m) <= PLANE_BAND_BIASES * bias_m:
             near_plane += 1
         else:
             errors.append(index)
@@ -302,15 +305,20 @@ def _edge_angle(point: np.ndarray, corners: list[np.ndarray], light: np.ndarray,
     return least
 
 
-def _plane_distance(point: np.ndarray, corners: list[np.ndarray], light: np.ndarray) -> float:
-    """Least distance from the planes of triangles, along the way to the light, where that way crosses the triangle."""
+def _plane_distance(point: np.ndarray, corners: list[np.ndarray], light: np.ndarray, on_plane_m: float) -> float:
+    """Least distance from the planes of triangles, along the way to the light, where that way crosses the triangle.
+
+    Planes within `on_plane_m` are those of the sample's own surface: the bias lifts it off them for certain, and were
+    they to excuse it, every answer would be right.
+    """
     a, b, c = corners
     normal = np.cross(b - a, c - a)
     way = light[:3] - light[3] * point
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        t = ((a - point) * normal).sum(1) / (normal @ way)
+        off = ((a - point) * normal).sum(1)
+        t = off / (normal @ way)
         at = point + t[:, None] * way
-        inside = np.ones(len(a), bool)
+        inside = np.abs(off) > on_plane_m * np.linalg.norm(normal, axis=1)
         for first, second in ((a, b), (b, c), (c, a)):
             inside &= (np.cross(second - first, at - first) * normal).sum(1) >= 0
         distance = np.abs(t) * np.linalg.norm(way)

@@ -354,6 +354,16 @@ def test_a_built_in_scene_in_16k_samples():
     assert (rays != reference).sum() <= 1e-3 * len(rays)
 
 
+def test_a_mask_that_is_wrong_everywhere_is_excused_nowhere():
+    """Every sample of a scene lies on the plane of a caster, which must not excuse it."""
+    samples, casters, light = gallery_case(4_000, 128)
+    points = view_points_m(samples, facing_samples(samples, light))[::40]
+    eye, bias_m = np.array(samples.camera.eye_m), default_bias_m(casters)
+    found = classify(points, np.ones(len(points), bool), casters, light, bias_m, eye)
+    assert found.near_plane == 0
+    assert found.errors > 0.98 * len(points)
+
+
 def test_mismatches_are_told_apart():
     """A triangle one metre before the light: one point behind its middle, one on its edge, one on its plane."""
     casters = Casters(np.array([[-1.0, -1, -1], [1, -1, -1], [0, 1, -1]]), np.array([[0, 1, 2]]))
@@ -362,6 +372,8 @@ def test_mismatches_are_told_apart():
     found = classify(points, np.ones(4, bool), casters, light, bias_m=1e-4)
     assert (found.near_edge, found.near_plane, found.errors) == (1, 1, 2)
     assert found.error_points.tolist() == [0, 3] and found.total == 4
+    # On the triangle itself: its own plane excuses nothing.
+    assert classify(np.array([[0.0, -0.2, -1.0]]), np.ones(1, bool), casters, light, bias_m=1e-4).errors == 1
     assert classify(points, np.zeros(4, bool), casters, light, 1e-4).total == 0
     assert facing_light(casters, light).tolist() == [True]
 
