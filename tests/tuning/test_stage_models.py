@@ -127,7 +127,7 @@ def test_what_a_dropped_term_would_give_is_the_error_of_refits_with_it():
     model = fit_stage(made, "tiled_deferred", "frame")
     assert model is not None and model.terms == ("lighting_computations",)
     alone, both = (
-        np.mean([left_out_error(made, out, terms) for out in made])
+        float(np.mean([left_out_error(made, out, terms) for out in made]))
         for terms in (("lighting_computations",), ("lighting_computations", "cells_total"))
     )
     # The engine takes the width of its robust loss from the residuals, the oracle the noise it was made with.
