@@ -18,6 +18,7 @@ from vtfs.parameters import PARAMETERS
 
 _MOST_LINES = 8
 _MOST_SLOPES = 3
+_MOST_IN_A_ROW = 4
 _LEAST_SLOPE = 0.01
 
 Answers = dict[str, list[dict[str, Any]]]
@@ -171,7 +172,7 @@ def _mattering(one: Mapping[str, Any]) -> str:
 
 
 def _choice(one: Mapping[str, Any]) -> str:
-    params = ", ".join(f"{name} {value:g}" for name, value in one["params"].items())
+    params = ", ".join(f"{name} {_text(value)}" for name, value in one["params"].items())
     return (
         f"{_named(one)}{params} of {one['of']}, {one['time_ms']:.4g} ms; if the model is wrong it is "
         f"{one['expected_regret']:.1%} slower than the fastest in the mean, "
@@ -183,7 +184,7 @@ def _moving(found: Answers) -> tuple[list[dict[str, Any]], Any]:
     ordered = sorted(found["influential"], key=lambda one: -one["slope"])
 
     def line(one: Mapping[str, Any]) -> str:
-        row = ", ".join(f"{name} {value:,.6g}" for name, value in list(one["row"].items())[:_MOST_SLOPES])
+        row = ", ".join(f"{name} {_text(value)}" for name, value in list(one["row"].items())[:_MOST_IN_A_ROW])
         return f"{_named(one)}{row or 'all rows are alike'} ({one['slope']:.2f})"
 
     return [one for one in ordered if one["slope"] >= _LEAST_SLOPE], line
@@ -192,6 +193,10 @@ def _moving(found: Answers) -> tuple[list[dict[str, Any]], Any]:
 def _named(one: Mapping[str, Any]) -> str:
     labels = ", ".join(value for name, value in one["labels"].items() if (name, value) != ("stage", FRAME))
     return f"{labels}: " if labels else ""
+
+
+def _text(value: object) -> str:
+    return f"{value:,.6g}" if isinstance(value, int | float) else str(value)
 
 
 def _finite(value: float) -> float | None:
