@@ -176,7 +176,7 @@ def _scored(
             continue
         costs, left_out, sound = _fitted(columns, times_ms, weights, chosen)
         if keep_constant:
-            with_constant = ~(sound & (costs[:, 0] < 0))
+            with_constant = ~(sound & (costs[:, 0] <= 0))  # rounding may leave nothing of it
         errors = np.abs(left_out).mean(axis=1)
         size = np.where(chosen > 0, sizes[chosen], 0).sum(axis=1)
         for k in np.flatnonzero(sound & (costs > 0).all(axis=1)):

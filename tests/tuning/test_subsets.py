@@ -122,3 +122,15 @@ def test_one_group_says_nothing_about_the_error():
     found = select_subset(replace(problem(0), group=np.zeros(24, int)), 3)
     assert found.chosen.support == (0,)
     assert found.errors == (np.inf,)
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0])
+def test_a_constant_that_is_nothing_but_rounding_hides_no_law(power):
+    # Its cost comes out as a little more than 0, a little less, or 0, by the order in which a machine adds.
+    for seed in range(8):
+        column = np.exp(np.random.default_rng(seed).uniform(0, 9, 7)) if seed else 2.0 ** np.arange(7)
+        times_ms = column**power
+        columns = np.column_stack([np.ones(7), times_ms])
+        found = select_subset(Problem(columns, times_ms, np.ones(7), np.array([0, 1]), np.zeros(2)), 1)
+        assert found.chosen.size == 1
+        assert_allclose(found.chosen.costs[-1], 1.0, rtol=1e-9)
