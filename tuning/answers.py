@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from tuning.budget_lines import asked_sizes, frame_keys, is_size, sizes_within
 from tuning.family import LIGHTS, TILES
 from tuning.questions import BUDGETS_MS, Answer, best_configuration, crossover, sensitivities
 from tuning.table_model import FRAME, TableModel
+from tuning.time_model import Influence, TimeModel
 from tuning.timing_table import TimingTable
 from vtfs.parameters import PARAMETERS
 
@@ -42,25 +43,39 @@ def answers(model: TableModel, table: TimingTable, seed: int = 0) -> Answers:
         "matters": list(_matters(model, table, rows)),
         "best": list(_best(model, table, rows, seed)),
         "influential": [
-            {"labels": _labels(model, part), "row": one.columns, "slope": one.slope}
+            {"labels": _labels(model, part), "row": _telling(model.models[part], one), "slope": one.slope}
             for key in rows
             for part in model.sums.get(key, (key,))
+            if model.models[part].n_rows > 1
             for one in model.models[part].influential
         ],
     }
 
 
 def answer_lines(found: Answers) -> Iterator[str]:
-    """Each kind of answer under a heading, at most eight lines of it; `sizes_within` has lines of its own."""
+    """Each kind of answer under a heading, at most eight lines of it; `sizes_within` has lines of its own.
+
+    Labels are named where they tell records apart.
+    """
+    crossing = [one for one in found["crossovers"] if one["value"] is not None]
+    moving = sorted(
+        (one for one in found["influential"] if one["slope"] >= _LEAST_SLOPE), key=lambda one: -one["slope"]
+    )
+    known: dict[str, set[str]] = {}
+    for one in itertools.chain(*found.values()):
+        for side in ("labels", "first", "second"):
+            for name, value in one.get(side, {}).items():
+                known.setdefault(name, set()).add(value)
+    telling = {name for name, values in known.items() if len(values) > 1}
     for title, records, line in (
-        ("Where another becomes faster:", [one for one in found["crossovers"] if one["value"] is not None], _crossing),
+        ("Where another becomes faster:", crossing, _crossing),
         ("What matters (a time grows by so many % where a column does by 1 %):", found["matters"], _mattering),
         ("Predicted best:", found["best"], _choice),
-        ("Rows that move predictions most (1 % longer, and all times are so many % longer):", *_moving(found)),
+        ("Rows that move predictions most (1 % longer, and all times are so many % longer):", moving, _moving),
     ):
         if records:
             yield title
-            yield from (f"  {line(one)}" for one in records[:_MOST_LINES])
+            yield from (f"  {line(one, telling)}" for one in records[:_MOST_LINES])
             if len(records) > _MOST_LINES:
                 yield f"  {len(records) - _MOST_LINES} more: --json FILE holds all"
 
@@ -143,6 +158,8 @@ def _best(
         distinct, configuration, n_rows = np.unique(values, axis=0, return_inverse=True, return_counts=True)
         if len(distinct) < 2 or np.ptp(n_rows) > 0:
             continue  # of frames that not all were timed on, none can be compared
+        if not any(part.columns for part in model.parts(key)):
+            continue  # a constant prefers nothing
         found = best_configuration(model.parts(key), columns, seed, configuration.ravel())
         yield {
             "labels": _labels(model, key),
@@ -154,45 +171,46 @@ def _best(
         }
 
 
-def _crossing(one: Mapping[str, Any]) -> str:
-    differ = [name for name in one["first"] if one["first"][name] != one["second"][name]]
-    same = ", ".join(value for name, value in one["first"].items() if name not in differ and name != "stage")
-    pair = " and ".join(one[side][differ[0]] for side in ("first", "second"))
-    far = ", extrapolated" if one["extrapolated"] else ""
+def _telling(model: TimeModel, row: Influence) -> dict[str, float]:
+    """What the law depends on; of a constant, all columns."""
+    return {name: row.columns[name] for name in model.columns if name in row.columns} or row.columns
+
+
+def _crossing(one: Mapping[str, Any], telling: Collection[str]) -> str:
+    differ = next(name for name in one["first"] if one["first"][name] != one["second"][name])
+    shared = {name: value for name, value in one["first"].items() if name != differ}
     # The chosen law may cross where no other plausible one does.
     interval = "no interval" if one["low"] is None else f"{one['low']:,.4g} to {one['high']:,.4g}"
-    ends = f"{interval}{far}; in {one['probability']:.0%} of plausible models"
-    return f"{pair}{f', {same}' if same else ''}: at {one['value']:,.4g} {one['column']} ({ends})"
-
-
-def _mattering(one: Mapping[str, Any]) -> str:
-    told = [f"{name} {slope:+.2f}" for name, slope in one["slopes"].items() if abs(slope) >= _LEAST_SLOPE]
-    at = ", ".join(f"{name} {value:,.6g}" for name, value in one["at"].items() if name in one["slopes"])
-    return f"{_named(one)}{', '.join(told[:_MOST_SLOPES]) or 'nothing'} (at {at})"
-
-
-def _choice(one: Mapping[str, Any]) -> str:
-    params = ", ".join(f"{name} {_text(value)}" for name, value in one["params"].items())
+    far = ", extrapolated" if one["extrapolated"] else ""
     return (
-        f"{_named(one)}{params} of {one['of']}, {one['time_ms']:.4g} ms; if the model is wrong it is "
-        f"{one['expected_regret']:.1%} slower than the fastest in the mean, "
-        f"below {one['worst_regret']:.1%} in 95 % of cases"
+        f"{_named(shared, telling)}{one['first'][differ]} and {one['second'][differ]} at {one['value']:,.4g} "
+        f"{one['column']} ({interval}{far}; in {one['probability']:.0%} of plausible models)"
     )
 
 
-def _moving(found: Answers) -> tuple[list[dict[str, Any]], Any]:
-    ordered = sorted(found["influential"], key=lambda one: -one["slope"])
-
-    def line(one: Mapping[str, Any]) -> str:
-        row = ", ".join(f"{name} {_text(value)}" for name, value in list(one["row"].items())[:_MOST_IN_A_ROW])
-        return f"{_named(one)}{row or 'all rows are alike'} ({one['slope']:.2f})"
-
-    return [one for one in ordered if one["slope"] >= _LEAST_SLOPE], line
+def _mattering(one: Mapping[str, Any], telling: Collection[str]) -> str:
+    told = [f"{name} {slope:+.2f}" for name, slope in one["slopes"].items() if abs(slope) >= _LEAST_SLOPE]
+    at = ", ".join(f"{name} {_text(one['at'][name])}" for name in one["slopes"])
+    return f"{_named(one['labels'], telling)}{', '.join(told[:_MOST_SLOPES]) or 'nothing'} (at {at})"
 
 
-def _named(one: Mapping[str, Any]) -> str:
-    labels = ", ".join(value for name, value in one["labels"].items() if (name, value) != ("stage", FRAME))
-    return f"{labels}: " if labels else ""
+def _choice(one: Mapping[str, Any], telling: Collection[str]) -> str:
+    params = ", ".join(f"{name} {_text(value)}" for name, value in one["params"].items())
+    return (
+        f"{_named(one['labels'], telling)}{params} (of {one['of']} settings), {one['time_ms']:.4g} ms; if the model is "
+        f"wrong, {one['expected_regret']:.1%} slower than the fastest in the mean, up to {one['worst_regret']:.1%} in "
+        "95 % of cases"
+    )
+
+
+def _moving(one: Mapping[str, Any], telling: Collection[str]) -> str:
+    row = ", ".join(f"{name} {_text(value)}" for name, value in list(one["row"].items())[:_MOST_IN_A_ROW])
+    return f"{_named(one['labels'], telling)}{row} ({one['slope']:.2f})"
+
+
+def _named(labels: Mapping[str, str], telling: Collection[str]) -> str:
+    told = [v for name, v in labels.items() if name in telling and v and (name, v) != ("stage", FRAME)]
+    return f"{', '.join(told)}: " if told else ""
 
 
 def _text(value: object) -> str:

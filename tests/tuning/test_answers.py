@@ -65,7 +65,7 @@ def test_rows_that_move_predictions_are_rows_of_the_table(of_lines):
 def test_answers_are_json_without_nan_and_lines_to_read(of_lines):
     json.dumps(of_lines, allow_nan=False)
     lines = list(answer_lines(of_lines))
-    assert any(line.startswith("  forward and tiled_deferred: at ") for line in lines)
+    assert any(line.startswith("  forward and tiled_deferred at ") for line in lines)
     assert not any(line.startswith("Predicted best") for line in lines)  # sizes vary: rows are not settings of one job
 
 
@@ -119,3 +119,22 @@ def test_frames_of_a_setting_are_taken_together():
     assert best["of"] == 5
     unequal = TimingTable({n: c[:-1] for n, c in columns.items()}, {}, times[:-1])
     assert answers(fit_groups(counted), unequal)["best"] == []  # one setting was timed on one frame only
+
+
+def test_a_constant_prefers_no_setting_and_a_single_row_moves_nothing_else():
+    rng = np.random.default_rng(3)
+    tiles = np.array([8.0, 16, 24, 32, 48, 64])
+    table = TimingTable({"tile_px": tiles}, {}, tuple((ms,) for ms in 5 * np.exp(0.05 * rng.normal(size=6))))
+    found = answers(fit_groups(table), table)
+    assert found["best"] == found["matters"] == []
+    one = TimingTable({"tile_px": tiles[:1]}, {}, ((5.0, 5.1),))
+    assert answers(fit_groups(one), one) == EMPTY
+
+
+def test_labels_are_named_where_they_tell_records_apart(of_lines):
+    alike = {name: [add_label(one) for one in records] for name, records in of_lines.items()}
+    assert list(answer_lines(alike)) == list(answer_lines(of_lines))
+
+
+def add_label(record):
+    return {k: {**v, "device": "one"} if k in ("labels", "first", "second") else v for k, v in record.items()}
