@@ -62,9 +62,8 @@ def rows(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, float]]:
 
 
 def main() -> None:
-    print(
-        "| record | left-out error: median, mean | regret: median, mean, worst | CPU s a fit |\n| --- | --- | --- | --- |"
-    )
+    print("| record | left-out error: median, mean | regret: median, mean, worst | CPU s a fit |")
+    print("| --- | --- | --- | --- |")
     every = []
     for path in sys.argv[1:]:
         for name, errors, regret, cpu_s in rows(Path(path)):

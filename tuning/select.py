@@ -41,8 +41,8 @@ def select_subset(problem: Problem, most_terms: int) -> Selection:
     """
     scored = score_subsets(problem, most_terms)
     path = _best_of_each_size(problem, scored, most_terms)
-    n_rows, n_groups = len(problem.times_ms), problem.n_groups
-    if n_groups == 1:
+    n_rows = len(problem.times_ms)
+    if problem.n_groups == 1:
         return Selection(path[0], tuple(path[:1]), (math.inf,), (math.inf,), tuple(scored))
     n_folds = n_folds_of(problem)
     fold = problem.folds(n_folds)
@@ -54,11 +54,31 @@ def select_subset(problem: Problem, most_terms: int) -> Selection:
         for one in within:
             predicted = problem.columns[held][:, list(one.support)] @ one.costs
             out[one.size, held] = np.abs(np.log(problem.times_ms[held] / np.maximum(predicted, 1e-300)))
+    return _smallest_good(problem, scored, path, out)
+
+
+def select_of_few(problem: Problem, most_terms: int) -> Selection:
+    """The same rule for few candidates, each with a physical reason, and few groups: the sets are selected once, on all
+    rows, and only their costs are fitted without the rows that they are to predict.
+
+    A selection inside each fold would throw out evidence that a handful of configurations cannot spare.
+    """
+    scored = score_subsets(problem, most_terms)
+    path = _best_of_each_size(problem, scored, most_terms)
+    if problem.n_groups == 1:
+        return Selection(path[0], tuple(path[:1]), (math.inf,), (math.inf,), tuple(scored))
+    out = np.full((most_terms + 1, len(problem.times_ms)), np.nan)
+    out[[one.size for one in path]] = _left_out(problem, [one.support for one in path])
+    return _smallest_good(problem, scored, path, out)
+
+
+def _smallest_good(problem: Problem, scored: list[Scored], path: list[Scored], out: np.ndarray) -> Selection:
+    """By left-out errors `[sizes, rows]`; a size that could not be fitted in every fold is not taken."""
     sizes = [one.size for one in path if np.isfinite(out[one.size]).all()]
     of_groups = {size: problem.group_means(out[size]) for size in sizes}
     errors = {size: float(own.mean()) for size, own in of_groups.items()}
     best = min(sizes, key=errors.__getitem__)
-    spread = {size: float(np.std(own, ddof=1) / np.sqrt(n_groups)) for size, own in of_groups.items()}
+    spread = {size: float(np.std(own, ddof=1) / np.sqrt(problem.n_groups)) for size, own in of_groups.items()}
     size = next(size for size in sorted(sizes) if errors[size] <= errors[best] + spread[best])
     return Selection(
         chosen=next(one for one in path if one.size == size),
@@ -69,32 +89,30 @@ def select_subset(problem: Problem, most_terms: int) -> Selection:
     )
 
 
-def errors_with(problem: Problem, support: tuple[int, ...], terms: Sequence[int]) -> tuple[float, list[float]]:
-    """The left-out error of a set, and with each of these terms added, by the folds of `select_subset`.
+def errors_with(problem: Problem, support: tuple[int, ...], terms: Sequence[int]) -> list[float]:
+    """The left-out error of a set with each of these terms added, as `select_of_few` takes it.
 
     Where a cost would not be positive in a fold the term is not used there, and the set as it is counts.
     """
     if problem.n_groups == 1:
-        return math.inf, [math.inf] * len(terms)
-    supports = [support, *(tuple(sorted((*support, term))) for term in terms)]
-    out = np.empty((len(supports), len(problem.times_ms)))
+        return [math.inf] * len(terms)
+    out = _left_out(problem, [support, *(tuple(sorted((*support, term))) for term in terms)])
+    return [float(problem.group_means(np.where(np.isnan(own), out[0], own)).mean()) for own in out[1:]]
+
+
+def _left_out(problem: Problem, supports: Sequence[tuple[int, ...]]) -> np.ndarray:
+    """Size of log(measured / predicted), `[sets, rows]`; NaN where a fold has no positive costs of a set."""
+    out = np.full((len(supports), len(problem.times_ms)), np.nan)
     fold = problem.folds(n_folds_of(problem))
     for k in range(int(fold.max()) + 1):
         held = fold == k
-        seen, times_ms = problem.rows(~held), problem.times_ms[held]
-        for row, one in enumerate(supports):
-            costs = positive_costs(seen, one)
-            if costs is None:
-                # The set as it is may lose a cost in a fold too: the constant is never lost.
-                out[row, held] = out[0, held] if row else _size_of_log(times_ms, np.median(seen.times_ms))
-            else:
-                out[row, held] = _size_of_log(times_ms, problem.columns[held][:, list(one)] @ costs)
-    errors = [float(problem.group_means(own).mean()) for own in out]
-    return errors[0], errors[1:]
-
-
-def _size_of_log(times_ms: np.ndarray, predicted_ms: np.ndarray) -> np.ndarray:
-    return np.abs(np.log(times_ms / np.maximum(predicted_ms, 1e-300)))
+        seen = problem.rows(~held)
+        for row, support in enumerate(supports):
+            costs = positive_costs(seen, support)
+            if costs is not None:
+                predicted = problem.columns[held][:, list(support)] @ costs
+                out[row, held] = np.abs(np.log(problem.times_ms[held] / np.maximum(predicted, 1e-300)))
+    return out
 
 
 def n_folds_of(problem: Problem) -> int:

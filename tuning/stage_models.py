@@ -6,7 +6,6 @@ intervals by bootstrap; how far off a model is says its left-out error.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from tuning.cost_model import CostModel
 from tuning.features import STAGE_TERMS, StageTimes, stage_times
 from tuning.measurement import Measurement
-from tuning.select import errors_with, select_subset
+from tuning.select import errors_with, select_of_few
 from tuning.subsets import Problem
 
 FEWEST_ROWS = 3
@@ -53,15 +52,13 @@ def fit_stage(
         return None
     problem = _problem(data)
     enough = n_rows >= FEWEST_ROWS and data.n_configurations >= 2
-    selection = select_subset(problem, min(MOST_TERMS, n_rows - 2) if enough else 0)
+    selection = select_of_few(problem, min(MOST_TERMS, n_rows - 2) if enough else 0)
     chosen = selection.chosen
     costs = dict(zip(chosen.support, map(float, chosen.costs), strict=True))
     fixed_ms = costs.pop(0, 0.0)
     others = [k + 1 for k in range(len(data.terms)) if k + 1 not in costs]
     loo_error = selection.error_of(chosen.size)
-    alone, errors = errors_with(problem, chosen.support, others)
-    # The error of the whole selection is larger than that of its set: what a term adds is told by the set.
-    added = [loo_error + error - alone if math.isfinite(error) else error for error in errors]
+    errors = errors_with(problem, chosen.support, others)
     return CostModel(
         technique=technique,
         stage=stage,
@@ -70,7 +67,7 @@ def fit_stage(
         ms_per_op=tuple(costs.values()),
         loo_error=loo_error,
         constant_loo_error=selection.error_of(0),
-        dropped=tuple((data.terms[k - 1], error) for k, error in zip(others, added, strict=True)),
+        dropped=tuple((data.terms[k - 1], error) for k, error in zip(others, errors, strict=True)),
         n=n_rows,
         n_configurations=data.n_configurations,
     )
