@@ -153,6 +153,7 @@ class RunFolder:
     pareto: tuple[Timed, ...]
     not_measured: tuple[tuple[str, str], ...]
     cost_models: tuple[StageModel, ...]
+    answer_lines: tuple[str, ...]
     predictions: tuple[Prediction, ...]
     counts: dict[str, dict[str, float]]
     stages_ms: dict[str, dict[str, float]]
@@ -215,6 +216,7 @@ def read_run_folder(folder: Path | str) -> RunFolder:
             (_text(item, "technique", at), _text(item, "reason", at)) for item, at in _records(result, "not_measured")
         ),
         cost_models=cost_models,
+        answer_lines=_lines(result, "answer_lines"),
         predictions=tuple(made for item, at in _records(result, "predictions") if (made := _prediction(item, at))),
         counts=_table(result, "counts"),
         stages_ms=_table(result, "stages"),
@@ -390,6 +392,13 @@ def _number(item: Mapping[str, Any], key: str, at: str) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"result.json: `{f'{at}.{key}' if at else key}` is {_kind(value)}; it must be a number.")
     return float(value) if math.isfinite(value) else None
+
+
+def _lines(result: Mapping[str, Any], key: str) -> tuple[str, ...]:
+    value = result.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(line, str) for line in value):
+        raise InputError(f"result.json: `{key}` must be a list of texts; `vtfs tune` writes it.")
+    return tuple(value)
 
 
 def _list_of_numbers(item: Mapping[str, Any], key: str, at: str) -> tuple[float, ...]:

@@ -86,6 +86,4 @@ def test_shadows_are_checked_and_timed(tmp_path):
     assert result["kind"] == "shadows" and result["measured"] == 1 and result["failed"] == 0
     assert result["best"]["error"] < 1e-4
     counts = result["counts"]["cluster_hierarchy"]
-    assert (
-        counts["shadow_lights"] == 2 and counts["casters"] > 20_000 and counts["test_and_set"] > counts["casters"]
-    )
+    assert counts["shadow_lights"] == 2 and counts["casters"] > 20_000 and counts["test_and_set"] > counts["casters"]

@@ -3,41 +3,70 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from tuning.family import COUNTS, TILES
 from tuning.questions import BUDGETS_MS, Answer, largest_within
-from tuning.table_model import TableModel
+from tuning.table_model import FRAME, TableModel
 
 _FURTHEST = 4.0
 """Times the largest size of the table: extrapolation is measured there (`benchmarks/cost_cases/synthetic.py`)."""
 _NOTHING = 1e-6
 
 
-def budget_lines(model: TableModel) -> Iterator[str]:
-    """A line for each frame time that depends on one column, the size that grows.
+@dataclass(frozen=True)
+class SizesWithin:
+    """What fits in the budgets.
 
-    Where stages are told apart only the frame is asked: a stage may not take all of the time.
+    - `low`, `high`: the sizes that were looked at.
+    - `within`: one for each of `BUDGETS_MS`.
     """
+
+    key: tuple[str, ...]
+    column: str
+    low: float
+    high: float
+    within: tuple[Answer, ...]
+
+    @property
+    def line(self) -> str:
+        sizes = ", ".join(
+            f"{_size(one, self.low, self.high)} within {ms:.1f} ms"
+            for one, ms in zip(self.within, BUDGETS_MS, strict=True)
+        )
+        return ", ".join(self.key) + f"{': ' if self.key else ''}{self.column} {sizes}"
+
+
+def frame_keys(model: TableModel) -> list[tuple[str, ...]]:
+    """The labels of whole frames: where stages are told apart, a stage may not take all of the time."""
     stage = model.label_names.index("stage") if "stage" in model.label_names else None
-    for key in dict.fromkeys((*model.models, *model.sums)):
-        if stage is not None and key[stage] != "frame":
-            continue
+    return [key for key in dict.fromkeys((*model.models, *model.sums)) if stage is None or key[stage] == FRAME]
+
+
+def is_size(column: str) -> bool:
+    """A tile has a best size, not a largest; a count of work follows from sizes."""
+    return column not in TILES | COUNTS
+
+
+def sizes_within(model: TableModel) -> Iterator[SizesWithin]:
+    """For each frame time that depends on one column, the size that grows."""
+    for key in frame_keys(model):
         parts = model.parts(key)
         columns = sorted({name for part in parts for name in part.columns})
-        # A tile has a best size, not a largest; a count of work follows from sizes.
-        if len(columns) != 1 or columns[0] in TILES | COUNTS:
+        if len(columns) != 1 or not is_size(columns[0]):
             continue
         (column,) = columns
-        fitted = np.concatenate([part.hull[column] for part in parts if column in part.columns])
-        # Sizes are spaced by logarithms: a table that begins at 0 needs a start above it. The hull has no inner sizes.
-        low, high = max(float(fitted.min()), _NOTHING * float(fitted.max())), _FURTHEST * float(fitted.max())
-        within = [largest_within(parts, budget_ms, column, low, high, {}) for budget_ms in BUDGETS_MS]
-        sizes = ", ".join(
-            f"{_size(one, low, high)} within {ms:.1f} ms" for one, ms in zip(within, BUDGETS_MS, strict=True)
-        )
-        yield ", ".join(key) + f"{': ' if key else ''}{column} {sizes}"
+        low, high = asked_sizes(np.concatenate([part.hull[column] for part in parts if column in part.columns]))
+        within = tuple(largest_within(parts, budget_ms, column, low, high, {}) for budget_ms in BUDGETS_MS)
+        yield SizesWithin(key, column, low, high, within)
+
+
+def asked_sizes(fitted: np.ndarray) -> tuple[float, float]:
+    """The smallest and the largest size that is looked at."""
+    # Sizes are spaced by logarithms: a table that begins at 0 needs a start above it. The hull has no inner sizes.
+    return max(float(fitted.min()), _NOTHING * float(fitted.max())), _FURTHEST * float(fitted.max())
 
 
 def _size(one: Answer, low: float, high: float) -> str:

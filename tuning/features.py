@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tuning.measurement import Measurement
+from tuning.repeat_weights import repeat_weights
 
 STAGE_TERMS: dict[str, tuple[str, ...]] = {
     "clusters": ("samples", "cells_total", "clusters_occupied"),
@@ -61,12 +62,14 @@ class StageTimes:
     - `terms`: the candidates that this data can tell from a constant.
     - `ops`: float64 `[rows, terms]`.
     - `times_ms`: float64 `[rows]`, medians over the repeats, all positive and finite.
+    - `weights`: float64 `[rows]`, of squared relative errors: rows whose repeats scatter count less.
     - `configuration`: int `[rows]`, which measurement a row belongs to, from 0 without gaps.
     """
 
     terms: tuple[str, ...]
     ops: np.ndarray
     times_ms: np.ndarray
+    weights: np.ndarray
     configuration: np.ndarray
 
     @property
@@ -119,6 +122,7 @@ def stage_times(measurements: Iterable[Measurement], stage: str, available: froz
     """
     frames: list[Mapping[str, float]] = []
     times_ms: list[float] = []
+    repeats_ms: list[list[float]] = []
     owner: list[int] = []
     n_owners = 0
     for measurement in measurements:
@@ -132,6 +136,7 @@ def stage_times(measurements: Iterable[Measurement], stage: str, available: froz
                 known = counts if available is None else {k: v for k, v in counts.items() if k in available}
                 frames.append(with_derived(known))
                 times_ms.append(median)
+                repeats_ms.append([ms for ms in finite if ms > 0])
                 owner.append(n_owners)
         n_owners += len(times_ms) > rows_before
 
@@ -142,4 +147,5 @@ def stage_times(measurements: Iterable[Measurement], stage: str, available: froz
     }
     columns = {term: column for term, column in columns.items() if np.ptp(column) > 0}
     ops = np.stack(list(columns.values()), axis=1) if columns else np.empty((len(frames), 0))
-    return StageTimes(tuple(columns), ops, np.array(times_ms), np.array(owner, int))
+    weights = repeat_weights(repeats_ms) if repeats_ms else np.empty(0)
+    return StageTimes(tuple(columns), ops, np.array(times_ms), weights, np.array(owner, int))

@@ -12,8 +12,10 @@ from tuning.bootstrap import bootstrap_costs
 from tuning.family import candidate_terms
 from tuning.law import Law
 from tuning.overlap import best_overlaps
+from tuning.repeat_weights import NOISE_FLOOR, repeat_weights
 from tuning.robust_fit import MOST_COSTS, Problems, influence, solve
-from tuning.subsets import Problem, Scored, Selection, select_subset
+from tuning.select import Selection, select_subset
+from tuning.subsets import Problem, Scored
 from tuning.terms import CONSTANT, Term
 from tuning.time_model import COVERAGE, Influence, LeftOut, PlausibleLaw, TimeModel, stretched
 
@@ -28,8 +30,6 @@ _CHI2_90 = 2.71
 _REFITS = 256
 _DIRECTIONS = 512
 _MOST_INFLUENTIAL = 3
-_NOISE_FLOOR = 0.005
-"""Relative: clocks and rounding leave no time better known than this."""
 
 
 def fit_law(
@@ -51,7 +51,7 @@ def fit_law(
     problem = Problem(
         np.stack([term.values(columns) for term in every], axis=1),
         times_ms,
-        _weights(repeats_ms),
+        repeat_weights(repeats_ms),
         np.array([term.size if term.factors else 0 for term in every]),
         np.array([term.surprise for term in every]),
     )
@@ -59,7 +59,7 @@ def fit_law(
     if terms and n_rows < _FEWEST_ROWS:
         messages.append(f"{n_rows} rows: too few to tell how wrong the law is; measure at least {_FEWEST_ROWS}.")
     selection = select_subset(problem, min(MOST_TERMS, max(n_rows - 3, int(n_rows == 3))))
-    delta = _HUBER * max(1.4826 * float(np.median(np.abs(selection.chosen.left_out))), _NOISE_FLOOR)
+    delta = _HUBER * max(1.4826 * float(np.median(np.abs(selection.chosen.left_out))), NOISE_FLOOR)
     found = [
         _Found(_law(every, one), one.size, error, spread, problem.merit(one))
         for one, error, spread in zip(selection.path, selection.errors, selection.standard_errors, strict=True)
@@ -194,7 +194,7 @@ def _with_error_bars(
         residual = np.log(problem.times_ms / law.predict(columns))
         softened = problem.weights / np.sqrt(1 + (residual / delta) ** 2)
         degrees = max(len(residual) - len(law.terms), 1)
-        spread = max(math.sqrt(float(np.sum(softened * residual**2)) / degrees / _SOFTENED), _NOISE_FLOOR)
+        spread = max(math.sqrt(float(np.sum(softened * residual**2)) / degrees / _SOFTENED), NOISE_FLOOR)
         covariance = np.linalg.pinv(slopes.T @ (softened[:, None] * slopes), hermitian=True) * spread**2
         found.append(PlausibleLaw(law, float(weight), covariance, spread))
     return tuple(found)
@@ -253,22 +253,3 @@ def _merged(
     keys = np.array(list(rows)).reshape(len(rows), len(columns))
     merged = {name: keys[:, k] for k, name in enumerate(columns)}
     return merged, [tuple(repeats) for repeats in rows.values()]
-
-
-def _weights(repeats_ms: Sequence[Sequence[float]]) -> np.ndarray:
-    """Of squared relative residuals, mean 1: rows whose repeats scatter count less.
-
-    The variance of a row is that of its median plus what no repeat shows, taken as the median of the former.
-    """
-    scatter = np.full(len(repeats_ms), np.nan)
-    for k, repeats in enumerate(repeats_ms):
-        if len(repeats) >= 3:
-            logs = np.log(repeats)
-            sigma = 1.4826 * np.median(np.abs(logs - np.median(logs)))
-            scatter[k] = sigma**2 * math.pi / 2 / len(repeats)
-    known = scatter[np.isfinite(scatter)]
-    if not len(known):
-        return np.ones(len(repeats_ms))
-    typical = max(float(np.median(known)), _NOISE_FLOOR**2)
-    weights = 1 / (np.where(np.isfinite(scatter), scatter, typical) + typical)
-    return weights / weights.mean()

@@ -10,12 +10,14 @@ import json
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tuning.answers import answer_lines, answers
+from tuning.budget_lines import sizes_within
 from tuning.choose import Objective, time_interval_ms, time_ms
 from tuning.imported_times import ImportedTimes
 from tuning.label_groups import fit_groups, predict_groups
@@ -64,7 +66,10 @@ def tune_imported(
             f"{imported.source}: only settings that change the image were timed; time one with gbuffer float32, "
             "light_cutoff 0 and approximate 0."
         )
-    model = fit_groups(_table(imported), seed)
+    table = _table(imported)
+    model = fit_groups(table, seed)
+    with_settings = replace(table, columns=table.columns | _settings(_timed_rows(imported)))
+    answered = answers(model, with_settings, seed)
     predicted = _predicted(imported, model, objective)
     fastest = min(exact, key=lambda c: time_ms(measurements[c], objective))
     fastest_ms = time_ms(measurements[fastest], objective)
@@ -113,6 +118,8 @@ def tune_imported(
             for e in untimed
             if e.interval_ms[0] < fastest_ms
         ][:_NEXT],
+        "answers": answered,
+        "answer_lines": [*(one.line for one in sizes_within(model)), *answer_lines(answered)],
         "cost_models": _cost_models(model),
         "predictions": [_prediction(e, measurements, objective) for e in predicted.values()],
         "counts": {
@@ -136,11 +143,15 @@ def _table(imported: ImportedTimes) -> TimingTable:
 
     Settings that change the image change what an operation costs: they are not fitted, nor predicted.
     """
-    rows = [(c, i) for c in imported.repeats_ms if c.is_exact for i in range(len(imported.frames))]
+    rows = _timed_rows(imported)
     columns = _features(imported, rows)
     return TimingTable(
         columns, {"technique": tuple(c.technique for c, _ in rows)}, tuple(imported.repeats_ms[c][i] for c, i in rows)
     )
+
+
+def _timed_rows(imported: ImportedTimes) -> list[tuple[Configuration, int]]:
+    return [(c, i) for c in imported.repeats_ms if c.is_exact for i in range(len(imported.frames))]
 
 
 def _features(imported: ImportedTimes, rows: Sequence[tuple[Configuration, int]]) -> dict[str, np.ndarray]:
@@ -149,6 +160,10 @@ def _features(imported: ImportedTimes, rows: Sequence[tuple[Configuration, int]]
     names = [name for name in names if name not in of_our_program(names)]
     if names:
         return {name: np.array([imported.counts[c][i].get(name, math.nan) for c, i in rows]) for name in names}
+    return _settings(rows)
+
+
+def _settings(rows: Sequence[tuple[Configuration, int]]) -> dict[str, np.ndarray]:
     params = [name for name, parameter in PARAMETERS.items() if not isinstance(parameter.default, str)]
     return {name: np.array([float(c.params.get(name, math.nan)) for c, _ in rows]) for name in params}
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from tuning.law import Law, combined
 from tuning.robust_fit import Problems, solve
-from tuning.subsets import Problem, n_folds_of
+from tuning.select import n_folds_of
+from tuning.subsets import Problem
 from tuning.terms import Term
 
 _FEWEST_ROWS = 10

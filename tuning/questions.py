@@ -42,7 +42,7 @@ class Answer:
 class Choice:
     """The configuration that is predicted to be fastest.
 
-    - `row`: of the candidates.
+    - `row`: of the candidates; or the number of the configuration, where several rows are one.
     - `expected_regret`, `worst_regret`: how much slower than the fastest it is, as a part of that, should the model be
       wrong: the mean over the samples, and what 95 % of them stay below.
     """
@@ -117,16 +117,26 @@ def sensitivities(parts: Parts, point: Mapping[str, float]) -> dict[str, float]:
     return dict(zip(names, map(float, slopes), strict=True))
 
 
-def best_configuration(parts: Parts, candidates: Mapping[str, np.ndarray], seed: int = 0) -> Choice:
+def best_configuration(
+    parts: Parts, candidates: Mapping[str, np.ndarray], seed: int = 0, configuration: np.ndarray | None = None
+) -> Choice:
     """The row that is predicted to be fastest, and what it costs should the model be wrong.
+
+    **Arguments:**
+
+    - `configuration`: int `[rows]`, from 0 without gaps: where a configuration has a row for each of some frames, their
+      mean decides. `None`: each row is one.
 
     **Raises:** `InputError` where there is no row, or a column is missing.
     """
     if not len(next(iter(candidates.values()), ())):
         raise InputError("candidates: there are none; give at least one configuration.")
     times_ms = _times_ms(parts, candidates)
-    row = int(times_ms.argmin())
     sampled = _samples_ms(parts, candidates, seed)
+    if configuration is not None:
+        means = np.eye(int(configuration.max()) + 1)[configuration] / np.bincount(configuration)
+        times_ms, sampled = times_ms @ means, sampled @ means
+    row = int(times_ms.argmin())
     regret = sampled[:, row] / sampled.min(axis=1) - 1
     return Choice(row, float(times_ms[row]), float(regret.mean()), float(np.quantile(regret, 0.95)))
 

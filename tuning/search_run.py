@@ -14,8 +14,8 @@ from tuning.cost_model import CostModel
 from tuning.features import main_work
 from tuning.measurement import Measurement
 from tuning.record import append_measurement, read_measurements
-from tuning.select import fit_stage
 from tuning.space import Space
+from tuning.stage_models import fit_stage
 from vtfs.input_error import InputError
 from vtfs.parameters import Configuration, configuration
 

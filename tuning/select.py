@@ -1,130 +1,137 @@
-"""The smallest cost model that the data supports: forward selection by leaving configurations out."""
+"""How many terms a law is allowed: cross-validation with the selection inside, and the one-standard-error rule."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.cost_model import CostModel
-from tuning.features import STAGE_TERMS, StageTimes, stage_times
-from tuning.fit import fit_costs, relative_design
-from tuning.measurement import Measurement
+from tuning.subsets import Problem, Scored, positive_costs, score_subsets
 
-FEWEST_ROWS = 3
-"""Below this a stage gets a constant."""
-
-MOST_FOLDS = 24
-"""With more configurations than this, several are left out at once: the time of a fit stays bounded."""
-
-_MOST_TERMS = 6
-_PATIENCE = 2  # terms tried past the best model: two may help only together
-
-
-def fit_models(
-    measurements: Iterable[Measurement], technique: str, available: frozenset[str] | None = None
-) -> dict[str, CostModel]:
-    """A model for every stage of a technique that was timed, in the order of the stages' table.
-
-    **Arguments:**
-
-    - `measurements`: of any techniques; failed ones are skipped.
-    - `available`: counts that are known before measuring; `None`: all.
-    """
-    own = [measurement for measurement in measurements if measurement.technique == technique]
-    timed = {stage for measurement in own for stage in measurement.stages_ms}
-    ordered = [stage for stage in STAGE_TERMS if stage in timed] + sorted(timed - STAGE_TERMS.keys())
-    models = {stage: fit_stage(own, technique, stage, available) for stage in ordered}
-    return {stage: model for stage, model in models.items() if model is not None}
-
-
-def fit_stage(
-    measurements: Iterable[Measurement], technique: str, stage: str, available: frozenset[str] | None = None
-) -> CostModel | None:
-    """The model of one stage, from the measurements of one technique; `None` where none of them timed it."""
-    data = stage_times(measurements, stage, available)
-    if not len(data.times_ms):
-        return None
-    constant = _left_out(data, ())
-    path = [constant]
-    if len(data.times_ms) >= FEWEST_ROWS and data.n_configurations >= 2:
-        path = _forward(data, constant)
-    chosen = _smallest_good(path)
-    costs = fit_costs(_design(data, chosen.terms))
-    # A term that costs nothing in the fit to everything says nothing.
-    kept = {term: float(cost) for term, cost in zip(chosen.terms, costs[1:], strict=True) if cost > 0}
-    others = [term for term in data.terms if term not in kept]
-    return CostModel(
-        technique=technique,
-        stage=stage,
-        terms=tuple(kept),
-        fixed_ms=float(costs[0]),
-        ms_per_op=tuple(kept.values()),
-        loo_error=chosen.loo_error,
-        constant_loo_error=constant.loo_error,
-        dropped=tuple((term, _left_out(data, (*kept, term)).loo_error) for term in others),
-        n=len(data.times_ms),
-        n_configurations=data.n_configurations,
-    )
+_SCORED_IN_A_FOLD = 30
+_FEW_TERMS = 60
 
 
 @dataclass(frozen=True)
-class _Candidate:
-    """A set of terms, and how far off it is for what it was not fitted to: one number a fold."""
+class Selection:
+    """The set that was taken, and what else was looked at.
 
-    terms: tuple[str, ...]
-    fold_errors: np.ndarray
-
-    @property
-    def loo_error(self) -> float:
-        return float(np.mean(self.fold_errors)) if len(self.fold_errors) else math.inf
-
-    @property
-    def standard_error(self) -> float:
-        n = len(self.fold_errors)
-        return float(np.std(self.fold_errors, ddof=1) / math.sqrt(n)) if n > 1 else 0.0
-
-
-def _forward(data: StageTimes, constant: _Candidate) -> list[_Candidate]:
-    """The constant, then each time the term that helps most, for as long as the last few helped."""
-    path = [constant]
-    while len(path[-1].terms) < min(_MOST_TERMS, len(data.terms)):
-        terms = path[-1].terms
-        tried = [_left_out(data, (*terms, term)) for term in data.terms if term not in terms]
-        path.append(min(tried, key=lambda candidate: candidate.loo_error))
-        best = min(range(len(path)), key=lambda k: path[k].loo_error)
-        if len(path) - 1 - best >= _PATIENCE:
-            break
-    return path
-
-
-def _smallest_good(path: list[_Candidate]) -> _Candidate:
-    """The one-standard-error rule (Breiman et al. 1984): the first whose error is within one of the best's."""
-    best = min(path, key=lambda candidate: candidate.loo_error)
-    return next(c for c in path if c.loo_error <= best.loo_error + best.standard_error)
-
-
-def _left_out(data: StageTimes, terms: tuple[str, ...]) -> _Candidate:
-    """Errors of predictions for configurations that were left out.
-
-    The mean size of `predicted / measured - 1`. Not its median, which is blind to the few configurations that are
-    predicted badly and so mislead a search (in simulated searches its worst choices were tens of times slower); not
-    its mean square, which one disturbed measurement rules. Frames of a configuration leave together: they are no
-    independent evidence.
+    - `path`: the best set of each size, on all rows.
+    - `errors`, `standard_errors`: of each size, each row predicted by the set that was *selected* without it. The
+      best of thousands of sets looks better than it is; this does not.
     """
-    n_folds = min(data.n_configurations, MOST_FOLDS)
-    if n_folds < 2:
-        return _Candidate(terms, np.empty(0))
-    design = _design(data, terms)
-    fold = data.configuration % n_folds
-    errors = np.empty(n_folds)
+
+    chosen: Scored
+    path: tuple[Scored, ...]
+    errors: tuple[float, ...]
+    standard_errors: tuple[float, ...]
+    scored: tuple[Scored, ...]
+
+    def error_of(self, size: int) -> float:
+        """Infinite where it is not known: there was one group only."""
+        return next((e for one, e in zip(self.path, self.errors, strict=True) if one.size == size), math.inf)
+
+
+def select_subset(problem: Problem, most_terms: int) -> Selection:
+    """The smallest size whose error is within one standard error of the best's (Breiman et al. 1984).
+
+    The error of a size is cross-validated with the selection inside: Hastie, Tibshirani, Friedman 2009, 7.10.2.
+    """
+    scored = score_subsets(problem, most_terms)
+    path = _best_of_each_size(problem, scored, most_terms)
+    n_rows = len(problem.times_ms)
+    if problem.n_groups == 1:
+        return Selection(path[0], tuple(path[:1]), (math.inf,), (math.inf,), tuple(scored))
+    n_folds = n_folds_of(problem)
+    fold = problem.folds(n_folds)
+    out = np.full((most_terms + 1, n_rows), np.nan)
     for k in range(n_folds):
-        out = fold == k
-        errors[k] = np.mean(np.abs(design[out] @ fit_costs(design[~out]) - 1))
-    return _Candidate(terms, errors)
+        held = fold == k
+        seen = problem.rows(~held)
+        within = _best_of_each_size(seen, score_subsets(seen, most_terms, _SCORED_IN_A_FOLD), most_terms)
+        for one in within:
+            predicted = problem.columns[held][:, list(one.support)] @ one.costs
+            out[one.size, held] = np.abs(np.log(problem.times_ms[held] / np.maximum(predicted, 1e-300)))
+    return _smallest_good(problem, scored, path, out)
 
 
-def _design(data: StageTimes, terms: tuple[str, ...]) -> np.ndarray:
-    return relative_design(data.ops[:, [data.terms.index(term) for term in terms]], data.times_ms)
+def select_of_few(problem: Problem, most_terms: int) -> Selection:
+    """The same rule for few candidates, each with a physical reason, and few groups: the sets are selected once, on all
+    rows, and only their costs are fitted without the rows that they are to predict.
+
+    A selection inside each fold would throw out evidence that a handful of configurations cannot spare.
+    """
+    scored = score_subsets(problem, most_terms)
+    path = _best_of_each_size(problem, scored, most_terms)
+    if problem.n_groups == 1:
+        return Selection(path[0], tuple(path[:1]), (math.inf,), (math.inf,), tuple(scored))
+    out = np.full((most_terms + 1, len(problem.times_ms)), np.nan)
+    out[[one.size for one in path]] = _left_out(problem, [one.support for one in path])
+    return _smallest_good(problem, scored, path, out)
+
+
+def _smallest_good(problem: Problem, scored: list[Scored], path: list[Scored], out: np.ndarray) -> Selection:
+    """By left-out errors `[sizes, rows]`; a size that could not be fitted in every fold is not taken."""
+    sizes = [one.size for one in path if np.isfinite(out[one.size]).all()]
+    of_groups = {size: problem.group_means(out[size]) for size in sizes}
+    errors = {size: float(own.mean()) for size, own in of_groups.items()}
+    best = min(sizes, key=errors.__getitem__)
+    spread = {size: float(np.std(own, ddof=1) / np.sqrt(problem.n_groups)) for size, own in of_groups.items()}
+    size = next(size for size in sorted(sizes) if errors[size] <= errors[best] + spread[best])
+    return Selection(
+        chosen=next(one for one in path if one.size == size),
+        path=tuple(path),
+        errors=tuple(errors.get(one.size, math.inf) for one in path),
+        standard_errors=tuple(spread.get(one.size, math.inf) for one in path),
+        scored=tuple(scored),
+    )
+
+
+def errors_with(problem: Problem, support: tuple[int, ...], terms: Sequence[int]) -> list[float]:
+    """The left-out error of a set with each of these terms added, as `select_of_few` takes it.
+
+    Where a cost would not be positive in a fold the term is not used there, and the set as it is counts.
+    """
+    if problem.n_groups == 1:
+        return [math.inf] * len(terms)
+    out = _left_out(problem, [support, *(tuple(sorted((*support, term))) for term in terms)])
+    return [float(problem.group_means(np.where(np.isnan(own), out[0], own)).mean()) for own in out[1:]]
+
+
+def _left_out(problem: Problem, supports: Sequence[tuple[int, ...]]) -> np.ndarray:
+    """Size of log(measured / predicted), `[sets, rows]`; NaN where a fold has no positive costs of a set."""
+    out = np.full((len(supports), len(problem.times_ms)), np.nan)
+    fold = problem.folds(n_folds_of(problem))
+    for k in range(int(fold.max()) + 1):
+        held = fold == k
+        seen = problem.rows(~held)
+        for row, support in enumerate(supports):
+            costs = positive_costs(seen, support)
+            if costs is not None:
+                predicted = problem.columns[held][:, list(support)] @ costs
+                out[row, held] = np.abs(np.log(problem.times_ms[held] / np.maximum(predicted, 1e-300)))
+    return out
+
+
+def n_folds_of(problem: Problem) -> int:
+    """Each group by itself where there are few; many candidates take too long for more than five folds."""
+    n_groups, n_terms = problem.n_groups, problem.columns.shape[1]
+    return n_groups if n_groups <= 12 else 10 if n_terms <= _FEW_TERMS else 5
+
+
+def _best_of_each_size(problem: Problem, scored: list[Scored], most: int) -> list[Scored]:
+    """Of the sets that are as good as the best, within one standard error of their difference, the plainest."""
+    best: dict[int, Scored] = {}
+    chosen: dict[int, Scored] = {}
+    for one in scored:  # best first within each size
+        if one.size > most:
+            continue
+        first = best.setdefault(one.size, one)
+        plainest = chosen.setdefault(one.size, one)
+        if problem.surprise[list(one.support)].sum() < problem.surprise[list(plainest.support)].sum():
+            worse = np.abs(one.left_out) - np.abs(first.left_out)
+            if worse.mean() <= worse.std(ddof=1) / np.sqrt(len(worse)):
+                chosen[one.size] = one
+    return [chosen[size] for size in sorted(chosen)]

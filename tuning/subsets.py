@@ -12,10 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 _SCORED = 200  # sets of a size that are fitted robustly, those with the smallest plain residual
-_SCORED_IN_A_FOLD = 30
 _MOST_NUMBERS = 400_000  # rows times sets at once: they are copied a few times, for each term
 _BEAM = 30  # sets of a size that are grown
-_FEW_TERMS = 60
 _MOST_PAIRS = 120_000
 _ROUNDS = 5
 _HUBER = 1.5  # residuals beyond this many standard deviations count by their size, not their square
@@ -45,6 +43,8 @@ class Problem:
     - `weights`: `[rows]`, of squared relative residuals, mean 1.
     - `sizes`: int `[terms]`, what a term adds to the size of a set.
     - `surprise`: `[terms]`, how unlikely a term is beforehand, in nats: of two that fit alike the plainer is taken.
+    - `group`: int `[rows]`, from 0 without gaps: rows of a group, as the frames of one configuration, are no
+      independent evidence and leave together. Each row by itself unless given.
     """
 
     columns: np.ndarray
@@ -52,15 +52,25 @@ class Problem:
     weights: np.ndarray
     sizes: np.ndarray
     surprise: np.ndarray
+    group: np.ndarray | None = None
 
     def rows(self, keep: np.ndarray) -> Problem:
-        return Problem(self.columns[keep], self.times_ms[keep], self.weights[keep], self.sizes, self.surprise)
+        group = None if self.group is None else np.unique(self.group[keep], return_inverse=True)[1]
+        return Problem(self.columns[keep], self.times_ms[keep], self.weights[keep], self.sizes, self.surprise, group)
+
+    @property
+    def n_groups(self) -> int:
+        return len(self.times_ms) if self.group is None else int(self.group.max()) + 1
 
     def folds(self, n: int) -> np.ndarray:
         """Which of `n` folds a row is in: neighbours in time in different ones, so that each sees the whole range."""
-        fold = np.empty(len(self.times_ms), int)
-        fold[np.argsort(self.times_ms, kind="stable")] = np.arange(len(fold)) % n
-        return fold
+        of_group = np.empty(self.n_groups, int)
+        of_group[np.argsort(self.group_means(self.times_ms), kind="stable")] = np.arange(len(of_group)) % n
+        return of_group if self.group is None else of_group[self.group]
+
+    def group_means(self, of_rows: np.ndarray) -> np.ndarray:
+        """`[groups]`, of one number a row."""
+        return of_rows if self.group is None else np.bincount(self.group, of_rows) / np.bincount(self.group)
 
     def merit(self, one: Scored) -> float:
         """Smaller is better: what the left-out rows say, and what was known beforehand."""
@@ -71,9 +81,7 @@ def score_subsets(problem: Problem, most_terms: int, most_scored: int = _SCORED)
     """The best sets of up to `most_terms` terms beside the constant, best first within each size, smallest first."""
     n_rows, n_terms = problem.columns.shape
     most_scored = min(most_scored, max(_MOST_NUMBERS // n_rows, _BEAM))
-    scale = (problem.columns / problem.times_ms[:, None]).max(axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    scaled = problem.columns / scale
+    scaled, scale = _scaled(problem)
     times_ms, weights, sizes = problem.times_ms, problem.weights, problem.sizes
     scored = _scored(scaled, times_ms, weights, np.zeros((1, 1), int), sizes)
     # The plain residual that picks sets to look at is ruled by an outlier: weights from the best set so far, twice.
@@ -101,76 +109,17 @@ def score_subsets(problem: Problem, most_terms: int, most_scored: int = _SCORED)
     return sorted(unscaled, key=lambda one: (one.size, problem.merit(one)))
 
 
-@dataclass(frozen=True)
-class Selection:
-    """The set that was taken, and what else was looked at.
-
-    - `path`: the best set of each size, on all rows.
-    - `errors`, `standard_errors`: of each size, each row predicted by the set that was *selected* without it. The
-      best of thousands of sets looks better than it is; this does not.
-    """
-
-    chosen: Scored
-    path: tuple[Scored, ...]
-    errors: tuple[float, ...]
-    standard_errors: tuple[float, ...]
-    scored: tuple[Scored, ...]
+def positive_costs(problem: Problem, support: tuple[int, ...]) -> np.ndarray | None:
+    """The costs of one set, robustly fitted; `None` where one of them would not be positive."""
+    scaled, scale = _scaled(problem)
+    costs, _, sound = _fitted(scaled, problem.times_ms, problem.weights, np.array([support]))
+    return costs[0] / scale[list(support)] if sound[0] and (costs > 0).all() else None
 
 
-def select_subset(problem: Problem, most_terms: int) -> Selection:
-    """The smallest size whose error is within one standard error of the best's (Breiman et al. 1984).
-
-    The error of a size is cross-validated with the selection inside: Hastie, Tibshirani, Friedman 2009, 7.10.2.
-    """
-    scored = score_subsets(problem, most_terms)
-    path = _best_of_each_size(problem, scored, most_terms)
-    n_rows = len(problem.times_ms)
-    if n_rows == 1:
-        return Selection(path[0], tuple(path), (np.inf,), (np.inf,), tuple(scored))
-    n_folds = n_folds_of(problem)
-    fold = problem.folds(n_folds)
-    out = np.full((most_terms + 1, n_rows), np.nan)
-    for k in range(n_folds):
-        held = fold == k
-        seen = problem.rows(~held)
-        within = _best_of_each_size(seen, score_subsets(seen, most_terms, _SCORED_IN_A_FOLD), most_terms)
-        for one in within:
-            predicted = problem.columns[held][:, list(one.support)] @ one.costs
-            out[one.size, held] = np.abs(np.log(problem.times_ms[held] / np.maximum(predicted, 1e-300)))
-    sizes = [one.size for one in path if np.isfinite(out[one.size]).all()]
-    errors = {size: float(out[size].mean()) for size in sizes}
-    best = min(sizes, key=errors.__getitem__)
-    spread = {size: float(np.std(out[size], ddof=1) / np.sqrt(n_rows)) for size in sizes}
-    size = next(size for size in sorted(sizes) if errors[size] <= errors[best] + spread[best])
-    return Selection(
-        chosen=next(one for one in path if one.size == size),
-        path=tuple(path),
-        errors=tuple(errors.get(one.size, np.inf) for one in path),
-        standard_errors=tuple(spread.get(one.size, np.inf) for one in path),
-        scored=tuple(scored),
-    )
-
-
-def n_folds_of(problem: Problem) -> int:
-    """Each row by itself where there are few; many candidates take too long for more than five folds."""
-    n_rows, n_terms = problem.columns.shape
-    return n_rows if n_rows <= 12 else 10 if n_terms <= _FEW_TERMS else 5
-
-
-def _best_of_each_size(problem: Problem, scored: list[Scored], most: int) -> list[Scored]:
-    """Of the sets that are as good as the best, within one standard error of their difference, the plainest."""
-    best: dict[int, Scored] = {}
-    chosen: dict[int, Scored] = {}
-    for one in scored:  # best first within each size
-        if one.size > most:
-            continue
-        first = best.setdefault(one.size, one)
-        plainest = chosen.setdefault(one.size, one)
-        if problem.surprise[list(one.support)].sum() < problem.surprise[list(plainest.support)].sum():
-            worse = np.abs(one.left_out) - np.abs(first.left_out)
-            if worse.mean() <= worse.std(ddof=1) / np.sqrt(len(worse)):
-                chosen[one.size] = one
-    return [chosen[size] for size in sorted(chosen)]
+def _scaled(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    scale = (problem.columns / problem.times_ms[:, None]).max(axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    return problem.columns / scale, scale
 
 
 def _grown(beam: np.ndarray, n_terms: int) -> np.ndarray:
@@ -227,7 +176,7 @@ def _scored(
             continue
         costs, left_out, sound = _fitted(columns, times_ms, weights, chosen)
         if keep_constant:
-            with_constant = ~(sound & (costs[:, 0] < 0))
+            with_constant = ~(sound & (costs[:, 0] <= 0))  # rounding may leave nothing of it
         errors = np.abs(left_out).mean(axis=1)
         size = np.where(chosen > 0, sizes[chosen], 0).sum(axis=1)
         for k in np.flatnonzero(sound & (costs > 0).all(axis=1)):

@@ -20,8 +20,8 @@ from tuning.choose import (
 from tuning.cost_model import CostModel
 from tuning.measurement import Measurement
 from tuning.search_run import Progress, SearchRun, Workload
-from tuning.select import fit_models
 from tuning.space import Space, accuracy_values
+from tuning.stage_models import fit_models
 from vtfs.parameters import SHADOW_NAMES, Configuration, configuration
 
 HOPELESS = 12

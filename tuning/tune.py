@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from tuning.answers import answer_lines
 from tuning.budget import Budget
 from tuning.choose import Objective, is_timed, median_interval, time_interval_ms, time_ms
 from tuning.compiles import watch_compiles
 from tuning.features import main_work
 from tuning.measurement import Measurement
 from tuning.run_pictures import draw
+from tuning.search_answers import search_answers
 from tuning.search_run import Progress
 from tuning.shadow_check import one_blending
 from tuning.space import Space, default_space
@@ -125,6 +127,8 @@ def tune(
         "not_measured": [
             {"technique": name, "reason": reason} for name, reason in (found.not_measured | found.not_explored).items()
         ],
+        "answers": (answered := search_answers(found, options.objective, options.seed)),
+        "answer_lines": list(answer_lines(answered)),
         "cost_models": [model.as_json() for stages in found.models.values() for model in stages.values()],
         "predictions": [
             {

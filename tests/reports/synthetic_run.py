@@ -114,6 +114,7 @@ def complete_run() -> Files:
                 "reason": "only its default: counts say 908,412,000 lighting computations, 24 times the least",
             }
         ],
+        "answer_lines": ["Predicted best:", "  volume_tiled_bvh: tile_px 16 <of> 24"],
         "cost_models": _cost_models(),
         "predictions": predictions,
         "counts": {

@@ -116,6 +116,7 @@ def test_a_missing_folder_is_named(tmp_path):
         ("[" * 200_000, "damaged"),
         ('{"schema": 1, "pareto": [1]}', r"`pareto\[0\]` is a number"),
         ('{"schema": 1, "cost_models": {}}', "`cost_models` is an object; it must be a list"),
+        ('{"schema": 1, "answer_lines": [1]}', "`answer_lines` must be a list of texts"),
         ('{"schema": 1, "counts": {"forward": 1}}', r"`counts\.forward` is a number"),
         ('{"schema": 1, "counts": {"forward": {"samples": "many"}}}', r"`counts\.forward\.samples` is text"),
         ('{"schema": 1, "gain": {"over_default": true}}', r"`gain\.over_default` is true or false"),

@@ -20,8 +20,8 @@ from tuning.choose import (
 )
 from tuning.cost_model import CostModel
 from tuning.measurement import FLOAT32_ERROR, Measurement, Outcome
-from tuning.select import fit_stage
 from tuning.space import Space
+from tuning.stage_models import fit_stage
 from vtfs.parameters import configuration
 
 

@@ -1,16 +1,11 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
-import scipy.optimize
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from tuning.cost_model import CostModel
 from tuning.features import operations, with_derived
-from tuning.fit import fit_costs, relative_design
 
 MODEL = CostModel(
     technique="volume_tiled_bvh",
@@ -24,35 +19,6 @@ MODEL = CostModel(
     n=12,
     n_configurations=4,
 )
-
-
-def test_fit_recovers_the_costs_that_made_the_times():
-    rng = np.random.default_rng(0)
-    ops = np.exp(rng.uniform(np.log(1e2), np.log(1e9), size=(30, 3)))
-    times_ms = 0.2 + ops @ np.array([2e-3, 0.0, 5e-6])  # by hand, not by the model under test
-    assert_allclose(fit_costs(relative_design(ops, times_ms)), [0.2, 2e-3, 0.0, 5e-6], rtol=1e-6, atol=1e-12)
-
-
-@given(seed=st.integers(0, 2**32 - 1), n_terms=st.integers(0, 9), n_rows=st.integers(1, 60))
-def test_fit_is_at_the_optimum_that_another_solver_finds(seed, n_terms, n_rows):
-    rng = np.random.default_rng(seed)
-    # Columns that grow together, as counts do, over many orders of magnitude; some are equal.
-    ops = np.exp(rng.normal(size=(n_rows, 1)) + 0.3 * rng.normal(size=(n_rows, n_terms)) + rng.uniform(0, 20, n_terms))
-    if n_terms > 2:
-        ops[:, 1] = 3 * ops[:, 0]
-    times_ms = np.exp(rng.normal(size=n_rows))
-    design = relative_design(ops, times_ms)
-    costs = fit_costs(design)
-    assert (costs >= 0).all()
-    scale = np.linalg.norm(design, axis=0)
-    bounded = scipy.optimize.lsq_linear(design / scale, np.ones(n_rows), bounds=(0, np.inf), method="bvls")
-    # The optimum is unique in its residual, not in its costs; both solvers stop at about 1e-10 of the gradient.
-    assert 0.5 * np.sum((design @ costs - 1) ** 2) <= bounded.cost * (1 + 1e-7) + 1e-9
-
-
-def test_a_zero_column_costs_nothing():
-    costs = fit_costs(relative_design(np.zeros((4, 1)), np.array([1.0, 1.0, 1.0, 1.0])))
-    assert_allclose(costs, [1.0, 0.0])
 
 
 def test_a_prediction_is_the_sum_of_the_costs():

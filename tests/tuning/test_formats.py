@@ -3,6 +3,7 @@
 import gzip
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -508,6 +509,32 @@ def test_t4_is_written_as_its_schema_wants_it(folder):
     assert result["times"]["compilation"] == 250.0 and result["times"]["runtimes"] == [1.0, 3.0]
     assert result["invalidity"] == "correct" and result["correctness"] == 1
     assert result["measurements"] == [{"name": "time", "value": 2.0, "unit": "ms"}] and result["objectives"] == ["time"]
+
+
+T4_RESULT = {"configuration": dict, "times": dict, "invalidity": str, "correctness": (int, float)}
+"""What the results schema requires of a result, and of what type; the rest is optional there."""
+
+
+@pytest.mark.parametrize("compile_ms", [None, (250.0, 1e3, 0.0)])
+def test_all_that_t4s_schema_requires_is_there_in_its_types(folder, compile_ms):
+    """By hand, after results-schema.json of github.com/odgaard/TuningSchema: no validator is among the dependencies."""
+    repeats = ((1.0, 3.0), (0.5,), (1e-6, 2e9, 4.0))
+    columns = {"tile": np.array([8.0, 0.5, 1e12]), "batch": np.array([1.0, math.nan, 3.0])}
+    write_t4(folder / "t4.json", TimingTable(columns, {"technique": ("a", "b", "c")}, repeats, compile_ms))
+    text = (folder / "t4.json").read_text()
+    content = json.loads(text, parse_constant=pytest.fail)  # NaN and Infinity are no JSON
+    assert re.fullmatch(r"[0-9]+\.[0-9]+\.[0-9]+", content["schema_version"])
+    assert len(content["results"]) == len(repeats)
+    for result in content["results"]:
+        assert all(isinstance(result[name], kind) for name, kind in T4_RESULT.items())
+        times = result["times"]
+        assert {"compilation", "runtimes", "framework", "search_algorithm", "validation"} <= times.keys()
+        assert all(isinstance(value, list if name == "runtimes" else (int, float)) for name, value in times.items())
+        assert all(isinstance(ms, (int, float)) for ms in times["runtimes"])
+        assert isinstance(result["objectives"], list)
+        for one in result["measurements"]:
+            assert isinstance(one["name"], str) and isinstance(one["value"], (int, float))
+            assert isinstance(one["unit"], str)
 
 
 def test_extra_p_lines_of_others(folder):

@@ -156,6 +156,15 @@ def test_the_result_has_the_keys_of_a_run(tuned):
     assert not any("shading_lanes" in term or "memory" in term for term in model["terms"])
 
 
+def test_what_the_models_answer_stands_in_the_result(tuned):
+    _, result = tuned
+    (matters,) = result["answers"]["matters"]
+    # The engine's time is made of lighting computations and a fixed part.
+    assert next(iter(matters["slopes"])) in result["cost_models"][0]["terms"][0]
+    assert result["answers"]["influential"]
+    assert any(line.startswith("What matters") for line in result["answer_lines"])
+
+
 def test_gains_are_over_what_was_timed(tuned):
     _, result = tuned
     default_ms = engine_ms(lighting_computations(32, 3), 3)

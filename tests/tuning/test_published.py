@@ -1,6 +1,8 @@
 """The package data is what the papers printed, once, with the passes that they did not print as a stage."""
 
+import csv
 from collections import Counter
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -71,6 +73,30 @@ def test_tiled_forward_crosses_60_and_30_frames_a_second_where_its_table_says():
     order = np.argsort(rows.columns["lights"])
     lights, times_ms = rows.columns["lights"][order], rows.median_ms[order]
     assert np.interp([1000 / 60, 1000 / 30], times_ms, lights) == pytest.approx([13723, 28580], abs=1)
+
+
+OURS = {
+    "tiled_forward": "tiled_forward_prez",
+    "volume_tiled_forward": "volume_tiled",
+    "volume_tiled_forward_bvh": "volume_tiled_bvh",
+}
+
+
+def test_the_rate_of_increase_of_all_eleven_rows():
+    """Table 10.14, `100 (t_max - t_min) / (l_max - l_min)` over the frames of a technique (Eq. 10.1)."""
+    table = rows_where(read_published("van_oosten_2017"), "stage", "frame")
+    with (files("tuning.published") / "van_oosten_2017_rate_of_increase.csv").open() as file:
+        printed = list(csv.DictReader(file))
+    assert len(printed) == 11
+    for rate in printed:
+        density = rate["light_density_mode"]
+        technique = OURS.get(rate["technique"], rate["technique"])
+        rows = chosen(table, technique=technique, scene=rate["scene"], density=density)
+        lights, times_ms = rows.columns["lights"], rows.median_ms
+        found = 100 * (times_ms[lights.argmax()] - times_ms[lights.argmin()]) / np.ptp(lights)
+        digits = len(rate["rate_ms_per_100_lights"].split(".")[1])
+        # A whole unit of the last digit: one of the eleven is printed cut off and not rounded.
+        assert abs(found - float(rate["rate_ms_per_100_lights"])) < 10.0**-digits, rate
 
 
 def test_of_means_minima_and_maxima_only_means():

@@ -1,13 +1,15 @@
 """Sets of terms against an obvious search with SciPy, and the left-out residuals against refits."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.optimize
 from numpy.testing import assert_allclose
 
-from tuning.subsets import Problem, score_subsets, select_subset
+from tuning.select import select_subset
+from tuning.subsets import Problem, score_subsets
 
 
 def problem(seed, n_terms=7, n_rows=24, noise=0.03, true=(2, 5)):
@@ -88,3 +90,47 @@ def test_an_outlier_does_not_move_the_costs():
     assert {2, 5} <= set(found.support)
     costs = dict(zip(found.support, found.costs, strict=True))
     assert_allclose([costs[2], costs[5]], 0.05, rtol=0.1)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rows_of_a_group_leave_together(seed):
+    given = problem(seed)
+    group = np.random.default_rng(seed).permutation(np.arange(24) // 3)
+    grouped = replace(given, group=group)
+    for n in (2, 3, 8):
+        fold = grouped.folds(n)
+        assert set(fold) == set(range(n))
+        assert all(len(set(fold[group == k])) == 1 for k in range(8))
+    held = group == 2
+    assert grouped.rows(~held).n_groups == 7
+    assert_allclose(grouped.group_means(given.times_ms)[2], given.times_ms[held].mean())
+
+
+def test_copies_of_rows_do_not_make_a_constant_look_better_than_it_is():
+    # Four groups of six equal rows each: left out one by one, each row is known from its copies.
+    columns = np.column_stack([np.ones(24), np.repeat([1.0, 5.0, 2.0, 3.0], 6)])
+    times_ms = np.repeat([1.0, 8.0, 3.0, 1.0], 6)
+    given = Problem(columns, times_ms, np.ones(24), np.array([0, 1]), np.zeros(2), np.repeat(np.arange(4), 6))
+    once = Problem(columns[::6], times_ms[::6], np.ones(4), given.sizes, given.surprise)
+    found, alone = select_subset(given, 1), select_subset(once, 1)
+    # The median size of residuals, which sets the width of the robust loss, is that of the same numbers.
+    assert_allclose(found.errors, alone.errors, rtol=1e-6)
+    assert_allclose(found.standard_errors, alone.standard_errors, rtol=1e-6)
+
+
+def test_one_group_says_nothing_about_the_error():
+    found = select_subset(replace(problem(0), group=np.zeros(24, int)), 3)
+    assert found.chosen.support == (0,)
+    assert found.errors == (np.inf,)
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0])
+def test_a_constant_that_is_nothing_but_rounding_hides_no_law(power):
+    # Its cost comes out as a little more than 0, a little less, or 0, by the order in which a machine adds.
+    for seed in range(8):
+        column = np.exp(np.random.default_rng(seed).uniform(0, 9, 7)) if seed else 2.0 ** np.arange(7)
+        times_ms = column**power
+        columns = np.column_stack([np.ones(7), times_ms])
+        found = select_subset(Problem(columns, times_ms, np.ones(7), np.array([0, 1]), np.zeros(2)), 1)
+        assert found.chosen.size == 1
+        assert_allclose(found.chosen.costs[-1], 1.0, rtol=1e-9)

@@ -69,6 +69,8 @@ def is_complete(result, out="out"):
     )
     model_keys = {"technique", "stage", "terms", "dropped", "coefficients", "loo_error"}
     assert all(model_keys <= set(model) for model in result["cost_models"])
+    assert {"within", "crossovers", "matters", "best", "influential"} == set(result["answers"])
+    assert all(isinstance(line, str) for line in result["answer_lines"])
     best = result["best"]
     low, high = best["time_ms_interval"]
     assert 0 < low <= best["time_ms"] <= high

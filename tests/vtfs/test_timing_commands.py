@@ -78,6 +78,27 @@ def test_a_label_that_looks_like_a_number_stays_one(tmp_path):
     assert [entry["time_ms"] for entry in found] == pytest.approx([2.01, 1.005], rel=0.01)
 
 
+def test_what_the_models_answer_is_printed_and_written(tmp_path):
+    """`a` takes 1 ms and 0.01 a light, `b` 5 ms and 0.002: they cross at 500 lights."""
+    rows = [f"{t},{n},{fixed + n * each}" for t, fixed, each in (("a", 1, 0.01), ("b", 5, 0.002)) for n in SIZES]
+    (tmp_path / "t.csv").write_text("\n".join(["technique,lights,time_ms", *rows]))
+    ran = vtfs("fit", tmp_path / "t.csv", "--json", tmp_path / "model.json")
+    assert ran.code == 0
+    written = json.loads((tmp_path / "model.json").read_text())["answers"]
+    (crossing,) = written["crossovers"]
+    # Exact rows: what is left is the grid of 512 sizes, a per cent apart, between which the gap is taken as a line.
+    assert crossing["value"] == pytest.approx(500, rel=1e-3)
+    assert f"a and b at {crossing['value']:,.4g} lights" in ran.out
+    assert "What matters" in ran.out and "Rows that move predictions most" in ran.out
+    # The model is read back with its answers beside it.
+    (tmp_path / "new.csv").write_text("technique,lights\na,400\n")
+    ran = vtfs("predict", tmp_path / "model.json", tmp_path / "new.csv", "--json", "-")
+    assert json.loads(ran.out)["predictions"][0]["time_ms"] == pytest.approx(5.0, rel=1e-3)
+
+
+SIZES = (50, 100, 200, 400, 800, 1600, 3200, 6400)
+
+
 def test_a_published_table_is_fitted_offline(tmp_path):
     ran = vtfs("fit", "--published", "olsson_2012", "--where", "technique=tiled_brute_force")
     assert ran.code == 0 and "4 rows, 1 model" in ran.out and "lights" in ran.out

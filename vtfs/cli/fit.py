@@ -52,6 +52,7 @@ def fit(
     if data is not None and published is not None:
         raise InputError(f"--published {published}: goes without DATA ({data}); leave one of them out.")
     layout = parsed_layout(time, unit, map_file, ignore)
+    from tuning.answers import answer_lines, answers
     from tuning.formats.grouping import without
     from tuning.formats.registry import read_table
     from tuning.label_groups import fit_groups
@@ -62,32 +63,35 @@ def fit(
     notes = []
     if data is None:
         source = published or DEFAULT
-        table = without(read_published(source), layout.ignore)
+        whole = table = without(read_published(source), layout.ignore)
     else:
         source = str(data)
-        table, left_out = explaining_columns(read_table(data, layout, format_name))
+        whole = read_table(data, layout, format_name)
+        table, left_out = explaining_columns(whole)
         if left_out:
             notes.append(f"Not taken for features: {', '.join(left_out)}.")
     if table.n_untimed:
         notes.append(
             f"{table.n_untimed} {'row has' if table.n_untimed == 1 else 'rows have'} no time, and were skipped."
         )
-    table = chosen_rows(table, where)
+    table, whole = chosen_rows(table, where), chosen_rows(whole, where)
     keep_compiled_programs()
     with Status() as status:
         status.say(f"fitting {len(table)} rows")
         model = fit_groups(table, seed)
-    write_json(json_file, model.as_json() | {"fitted_to": source})
+        status.say("asking what the models say")
+        found = answers(model, whole, seed)
+    write_json(json_file, model.as_json() | {"fitted_to": source, "answers": found})
     if json_file == "-":
         return
-    from tuning.budget_lines import budget_lines
+    from tuning.budget_lines import sizes_within
     from tuning.model_table import print_models
 
     print(f"{source}: {len(table)} rows, {len(model.models)} {'model' if len(model.models) == 1 else 'models'}")
     for note in notes:
         print(note)
     print_models(model)
-    for line in budget_lines(model):
+    for line in (*(one.line for one in sizes_within(model)), *answer_lines(found)):
         print(line)
     if json_file:
         print(f"Model: {json_file}")

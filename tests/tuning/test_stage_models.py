@@ -4,10 +4,11 @@ import warnings
 
 import numpy as np
 import pytest
+import scipy.optimize
 
 from tuning.features import STAGE_TERMS
 from tuning.measurement import Measurement, Outcome
-from tuning.select import fit_models, fit_stage
+from tuning.stage_models import fit_models, fit_stage
 
 
 def measurement(
@@ -95,18 +96,43 @@ def test_where_there_is_only_noise_the_model_is_a_constant(seed):
     assert all(error > 0.9 * model.loo_error for _, error in model.dropped)
 
 
-def test_the_left_out_error_is_that_of_an_obvious_loop():
-    made = made_by({"lighting_computations": 1e-6}, 5, seed=1, noise=0.2)
-    errors = []
-    for left_out in made:
-        rest = [m for m in made if m is not left_out]
-        # The constant that minimises sum((c / y - 1)^2) is sum(1/y) / sum(1/y^2).
-        y = np.array([np.median(r) for m in rest for r in m.stages_ms["frame"]])
-        constant = np.sum(1 / y) / np.sum(1 / y**2)
-        errors.append(np.mean([abs(constant / np.median(r) - 1) for r in left_out.stages_ms["frame"]]))
+@pytest.mark.parametrize("n_frames", [1, 3])
+def test_the_left_out_error_is_that_of_whole_configurations(n_frames):
+    # Frames that agree are no evidence about each other: with them left in the error would be nearly 0.
+    made = [measurement([{"samples": 7}] * n_frames, [(ms, ms)] * n_frames) for ms in (2.0, 4.0, 8.0)]
     model = fit_stage(made, "tiled_deferred", "frame")
     assert model is not None
-    assert model.constant_loo_error == pytest.approx(np.mean(errors), rel=1e-9)
+    # The constant of two times is their geometric mean: off by 1.5, 0 and 1.5 octaves. Five Gauss-Newton steps.
+    assert model.loo_error == model.constant_loo_error == pytest.approx(math.log(2.0), rel=1e-3)
+
+
+def left_out_error(made, out, terms) -> float:
+    """By SciPy's robust least squares in logs, of costs that are positive as they are exponentials."""
+    design, times_ms = rows_of([m for m in made if m is not out], terms)
+    asked, asked_ms = rows_of([out], terms)
+    start = np.log([3.0, *(1e-6, 1e-9)[: len(terms)]])
+    found = scipy.optimize.least_squares(
+        lambda x: np.log(design @ np.exp(x) / times_ms), start, loss="soft_l1", f_scale=0.075
+    )
+    return float(np.mean(np.abs(np.log(asked @ np.exp(found.x) / asked_ms))))
+
+
+def rows_of(made, terms) -> tuple[np.ndarray, np.ndarray]:
+    rows = [(c, ms[0]) for m in made for c, ms in zip(m.counts, m.stages_ms["frame"], strict=True)]
+    return np.array([[1.0, *(c[term] for term in terms)] for c, _ in rows]), np.array([ms for _, ms in rows])
+
+
+def test_what_a_dropped_term_would_give_is_the_error_of_refits_with_it():
+    made = made_by({"lighting_computations": 1e-6}, 8, seed=1, noise=0.05)
+    model = fit_stage(made, "tiled_deferred", "frame")
+    assert model is not None and model.terms == ("lighting_computations",)
+    alone, both = (
+        float(np.mean([left_out_error(made, out, terms) for out in made]))
+        for terms in (("lighting_computations",), ("lighting_computations", "cells_total"))
+    )
+    # The engine takes the width of its robust loss from the residuals, the oracle the noise it was made with.
+    assert model.loo_error == pytest.approx(alone, rel=0.1)
+    assert dict(model.dropped)["cells_total"] - model.loo_error == pytest.approx(both - alone, abs=0.05 * alone)
 
 
 def test_one_disturbed_measurement_does_not_hide_the_law():
@@ -123,8 +149,8 @@ def test_two_rows_get_a_constant_with_an_honest_error():
     model = fit_stage(two, "tiled_deferred", "frame")
     assert model is not None
     assert (model.terms, model.n, model.n_configurations) == ((), 2, 2)
-    # Each is predicted by the other: |4/2 - 1| and |2/4 - 1|.
-    assert model.loo_error == pytest.approx(0.75)
+    # Each is predicted by the other, an octave off.
+    assert model.loo_error == pytest.approx(math.log(2))
 
 
 def test_one_configuration_says_nothing_about_the_error():
