@@ -13,7 +13,7 @@ from tuning.family import candidate_terms
 from tuning.law import Law
 from tuning.overlap import best_overlaps
 from tuning.robust_fit import MOST_COSTS, Problems, influence, solve
-from tuning.subsets import Problem, Scored, Selection, select_subset
+from tuning.subsets import DIFFERENCE, Problem, Scored, Selection, select_subset
 from tuning.terms import CONSTANT, Term
 from tuning.time_model import COVERAGE, Influence, LeftOut, PlausibleLaw, TimeModel, stretched
 
@@ -68,7 +68,8 @@ def fit_law(
     overlaps = best_overlaps(problem, every, delta) if selection.chosen.size > 1 else []
     found += [_Found(one.law, one.size, one.error, one.standard_error, one.merit) for one in overlaps]
     best = min(found, key=lambda one: one.error)
-    chosen = min((one for one in found if one.error <= best.error + best.spread), key=lambda one: (one.size, one.error))
+    enough = [one for one in found if one.error <= best.error + DIFFERENCE * best.spread]
+    chosen = min(enough, key=lambda one: (one.size, one.error))
     law, dropped = _identified(problem, columns, chosen.law, delta)
     if dropped:
         messages += dropped

@@ -21,6 +21,10 @@ _MOST_PAIRS = 120_000
 _ROUNDS = 5
 _HUBER = 1.5  # residuals beyond this many standard deviations count by their size, not their square
 
+DIFFERENCE = float(np.sqrt(2.0))
+"""Standard error of the difference of two errors that are alike, in that of one: the best of several sizes looks better
+than it is."""
+
 
 @dataclass(frozen=True)
 class Scored:
@@ -123,7 +127,7 @@ class Selection:
 
 
 def select_subset(problem: Problem, most_terms: int) -> Selection:
-    """The smallest size whose error is within one standard error of the best's (Breiman et al. 1984).
+    """The smallest size whose error is within one standard error of the best's (Breiman et al. 1984), see `DIFFERENCE`.
 
     The error of a size is cross-validated with the selection inside: Hastie, Tibshirani, Friedman 2009, 7.10.2.
     """
@@ -146,7 +150,7 @@ def select_subset(problem: Problem, most_terms: int) -> Selection:
     errors = {size: float(out[size].mean()) for size in sizes}
     best = min(sizes, key=errors.__getitem__)
     spread = {size: float(np.std(out[size], ddof=1) / np.sqrt(n_rows)) for size in sizes}
-    size = next(size for size in sorted(sizes) if errors[size] <= errors[best] + spread[best])
+    size = next(size for size in sorted(sizes) if errors[size] <= errors[best] + DIFFERENCE * spread[best])
     return Selection(
         chosen=next(one for one in path if one.size == size),
         path=tuple(path),
