@@ -42,7 +42,7 @@ COUNTS = frozenset(
 STAGES = {"build_bvh": "build_tree", "assign_lights": "assign", "light_culling": "assign"}
 """Names that publications use for our stages."""
 
-_MOST_KNOTS = 6
+_MOST_KNOTS = 6  # of a column; of the only one at every second value: a cut is to be found where it is
 _FEWEST_VALUES = 10
 _MOST_PRODUCTS = 400
 
@@ -69,7 +69,7 @@ def candidate_terms(columns: Mapping[str, np.ndarray], stage: str | None = None)
         terms += [Term((factor,)) for factor in _factors(name, column, stage)]
     terms += _products(usable, stage)
     for name, column in usable.items():
-        terms += _cut(name, column)
+        terms += _cut(name, column, _MOST_KNOTS if len(usable) > 1 else max(_MOST_KNOTS, len(column) // 2))
     return _told_apart(terms, usable, messages), messages
 
 
@@ -106,13 +106,13 @@ def _products(usable: Mapping[str, np.ndarray], stage: str | None) -> list[Term]
     return whole if len(whole) <= _MOST_PRODUCTS else [Term((Factor(a), Factor(b))) for a, b in pairs]
 
 
-def _cut(name: str, column: np.ndarray) -> list[Term]:
+def _cut(name: str, column: np.ndarray, most_knots: int) -> list[Term]:
     """Cut at values that leave at least three on either side; not where there are few to tell a cut from a curve."""
     values = np.unique(column)
     inner = values[2:-3]
     if len(values) < _FEWEST_VALUES:
         return []
-    knots = inner[np.unique(np.linspace(0, len(inner) - 1, _MOST_KNOTS).round().astype(int))]
+    knots = inner[np.unique(np.linspace(0, len(inner) - 1, most_knots).round().astype(int))]
     return [Term((Factor(name),), shape, float(k)) for k in knots for shape in ("up_to", "beyond", "step")]
 
 

@@ -154,13 +154,14 @@ def _judged(table: _Table, terms: Sequence[Term], scale: np.ndarray, tried: Sequ
     weights = np.concatenate([np.tile(problem.weights * (fold != k), (len(specs), 1)) for k in range(n_folds)])
     starts = np.tile(np.array([one.log_costs for one in tried]), (n_folds, 1))
     refitted, losses = table.solve(specs * n_folds, weights, starts)
-    left_out = np.empty(len(fold))
+    left_out, of_first = np.empty(len(fold)), np.empty(len(fold))
     for k in range(n_folds):
         lanes = slice(k * len(specs), (k + 1) * len(specs))
         best = int(table.merits(specs, losses[lanes]).argmin())
-        design, sides = table.scaled[fold == k][:, _places(specs[best])], np.array(_sides(specs[best]))
-        predicted = combined(design, np.exp(refitted[lanes][best]), sides)
-        left_out[fold == k] = np.abs(np.log(problem.times_ms[fold == k] / predicted))
+        for which, errors in ((best, left_out), (0, of_first)):
+            design, sides = table.scaled[fold == k][:, _places(specs[which])], np.array(_sides(specs[which]))
+            predicted = combined(design, np.exp(refitted[lanes][which]), sides)
+            errors[fold == k] = np.abs(np.log(problem.times_ms[fold == k] / predicted))
     places = _places(specs[0])
     costs = np.exp(tried[0].log_costs) / scale[places]
     law = Law(tuple(terms[k] for k in places), tuple(map(float, costs)), tuple(_sides(specs[0])))
@@ -169,7 +170,8 @@ def _judged(table: _Table, terms: Sequence[Term], scale: np.ndarray, tried: Sequ
         sum(terms[k].size for k in places if k) + 1,
         float(left_out.mean()),
         float(np.std(left_out, ddof=1) / np.sqrt(len(fold))),
-        tried[0].merit,
+        # By rows it was not fitted to, as sets of terms are: the two are weighed against each other.
+        problem.merit_of(float(of_first.mean()), [k for k in places if k]),
     )
 
 

@@ -7,6 +7,7 @@ most six unknowns are one batched call, and leaving a row out is a formula and n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,7 +75,11 @@ class Problem:
 
     def merit(self, one: Scored) -> float:
         """Smaller is better: what the left-out rows say, and what was known beforehand."""
-        return len(self.times_ms) * float(np.log(one.error + 1e-6)) + float(self.surprise[list(one.support)].sum())
+        return self.merit_of(one.error, one.support)
+
+    def merit_of(self, error: float, support: Sequence[int]) -> float:
+        """The same for any law of these terms whose rows that it was not fitted to are off by `error` in the mean."""
+        return len(self.times_ms) * float(np.log(error + 1e-6)) + float(self.surprise[list(support)].sum())
 
 
 def score_subsets(problem: Problem, most_terms: int, most_scored: int = _SCORED) -> list[Scored]:
@@ -140,7 +145,7 @@ def _ranked(problem: Problem, columns: np.ndarray, weights: np.ndarray, supports
     costs = _solved(matrix, target)
     explained = np.einsum("sk,sk->s", costs, target)
     without = _solved(matrix[:, 1:, 1:], target[:, 1:]) if supports.shape[1] > 1 else np.empty((len(supports), 0))
-    floating = costs[:, 0] < 0
+    floating = costs[:, 0] <= 0
     explained = np.where(floating, np.einsum("sk,sk->s", without, target[:, 1:]), explained)
     positive = np.where(floating, (without > 0).all(axis=1), (costs[:, 1:] > 0).all(axis=1))
     unexplained = np.maximum(weights.sum() - explained, 1e-12 * weights.sum())

@@ -17,6 +17,10 @@ _EXPONENT_SPREAD = 0.5
 """Standard deviation of the exponent by which a law may be wrong beyond its data, times the degrees of freedom."""
 
 
+_MOST_MOVED = 60.0
+"""Logs of costs move no further in a sample: a cost that is all but zero has a spread without an end."""
+
+
 @dataclass(frozen=True)
 class Prediction:
     """Milliseconds; a measured time lies within `[low_ms, high_ms]` with 90 % probability.
@@ -135,7 +139,7 @@ class TimeModel:
         for k, one in enumerate(self.laws):
             own = of_law == k
             moved = rng.multivariate_normal(np.zeros(len(one.covariance)), one.covariance, own.sum(), method="eigh")
-            costs = np.array(one.law.costs_ms) * np.exp(moved)
+            costs = np.array(one.law.costs_ms) * np.exp(np.clip(moved, -_MOST_MOVED, _MOST_MOVED))
             sampled[own] = combined(one.law.design(columns), costs, np.array(one.law.sides))
         return sampled * np.exp(exponent[:, None] * self.beyond(columns))
 

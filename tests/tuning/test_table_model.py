@@ -64,8 +64,11 @@ def test_two_resources_at_once_are_a_maximum():
     rng = np.random.default_rng(5)
     cpu, gpu = np.exp(rng.uniform(0, 5, (2, 40)))
     times_ms = noisy(np.maximum(0.5 + 0.3 * cpu, 1.0 + 0.1 * gpu), seed=5, noise=0.02)
-    law = only(fit_table(table({"cpu_work": cpu, "gpu_work": gpu}, times_ms))).law
+    model = only(fit_table(table({"cpu_work": cpu, "gpu_work": gpu}, times_ms)))
+    law = model.law
     assert "max" in law.text
+    # No sum comes near it on these rows, so it rules its own intervals.
+    assert model.laws[0].weight > 0.5
     assert {t.name: s for t, s in zip(law.terms, law.sides, strict=True) if t.factors} in (
         {"cpu_work": 0, "gpu_work": 1},
         {"cpu_work": 1, "gpu_work": 0},
@@ -92,7 +95,7 @@ def test_a_constant_without_columns():
 
 def test_costs_have_intervals_and_rows_an_influence():
     x = np.append(np.geomspace(10, 100, 14), 1e5)
-    times_ms = noisy(1 + 1e-3 * x, seed=6)
+    times_ms = noisy(1 + 1e-3 * x, seed=11)
     one = only(fit_table(table({"x": x}, times_ms)))
     true = {"1": 1.0, "x": 1e-3}
     for term, (low, high) in zip(one.law.terms, one.cost_intervals_ms, strict=True):
