@@ -14,7 +14,7 @@ from scipy.special import bdtr, ndtr
 from tuning.cost_model import CostModel
 from tuning.measurement import FLOAT32_ERROR, Measurement
 from tuning.space import Space
-from vtfs.parameters import Configuration, Value, configuration
+from vtfs.parameters import Configuration, Value
 
 Objective = Literal["max", "mean"]
 """The slowest frame decides, or the mean over frames."""
@@ -89,7 +89,7 @@ def initial_design(space: Space, counts_of: CountsOf, seed: int = 0, per_techniq
     Those are the configurations next to the points of a Latin hypercube over the ranks of the values. What would
     do the same work as one before it is left out.
     """
-    design = [configuration(technique) for technique in space.techniques]
+    design = [space.default(technique) for technique in space.techniques]
     seen = {work_done(candidate, counts_of(candidate)) for candidate in design}
     by_technique = []
     for technique in space.techniques:

@@ -185,7 +185,7 @@ class SearchRun:
 
     def fitted(self, space: Space) -> list[Measurement]:
         """What models are fitted to: not the accuracy settings, which change the cost of an operation."""
-        return [m for c, m in self.measured.items() if c in space or c == configuration(c.technique)]
+        return [m for c, m in self.measured.items() if c in space or c == space.default(c.technique)]
 
     def available(self, technique: str) -> frozenset[str]:
         """Names of the counts of a technique that are known before measuring."""

@@ -20,6 +20,10 @@ LARGEST_SPACE = 100_000
 """More combinations than this are refused: counting them all would take hours."""
 
 
+_WHAT = ("blending",)
+"""Parameters that say what is drawn, not how."""
+
+
 @dataclass(frozen=True)
 class Space:
     """Every combination of `values` that keeps the `constraints`, for each technique.
@@ -45,6 +49,11 @@ class Space:
 
     def __contains__(self, candidate: object) -> bool:
         return candidate in self._members
+
+    def default(self, technique: str) -> Configuration:
+        """A technique's default, but drawing what the space says: one kind of shadow is no other's default."""
+        given = self.values.get(technique, {})
+        return configuration(technique, {name: given[name][0] for name in _WHAT if len(given.get(name, ())) == 1})
 
     def limited_to(self, techniques: Iterable[str]) -> Space:
         """The same space with some of its techniques."""

@@ -22,7 +22,7 @@ from tuning.measurement import Measurement
 from tuning.search_run import Progress, SearchRun, Workload
 from tuning.space import Space, accuracy_values
 from tuning.stage_models import fit_models
-from vtfs.parameters import SHADOW_NAMES, Configuration, configuration
+from vtfs.parameters import SHADOW_NAMES, Configuration
 
 HOPELESS = 12
 """A technique whose default needs this many times the lighting computations of the thriftiest is not measured."""
@@ -136,7 +136,7 @@ def search(
     return SearchResult(
         measurements=tuple(run.measured.values()),
         best=run.measured[best],
-        default=run.timed(configuration(best.technique)),
+        default=run.timed(space.default(best.technique)),
         fastest_default=_measurement(run, run.fastest(defaults)),
         models=models,
         predictions=_predictions(hopeful, run, models, objective),
@@ -153,7 +153,7 @@ def _hopeful(space: Space, run: SearchRun, keep: Collection[str]) -> tuple[Space
     unreachable = [name for name in space.techniques if name not in reachable]
     excluded = dict.fromkeys(unreachable, "the constraints leave no configuration of it")
     space = space.limited_to(reachable)
-    defaults = {name: configuration(name) for name in space.techniques}
+    defaults = {name: space.default(name) for name in space.techniques}
     work = {name: run.main_work(default) for name, default in defaults.items() if run.counts(default)}
     least = min(work.values(), default=0)
     unit = "tests" if set(space.techniques) & set(SHADOW_NAMES) else "lighting computations"
@@ -171,7 +171,7 @@ def _explored(space: Space, run: SearchRun) -> tuple[Space, dict[str, str]]:
     times = {
         name: time_ms(measurement, run.objective)
         for name in space.techniques
-        if (measurement := run.timed(configuration(name))) is not None
+        if (measurement := run.timed(space.default(name))) is not None
     }
     least = min(times.values(), default=0.0)
     reasons = {

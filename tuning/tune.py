@@ -75,7 +75,12 @@ def tune(
         options.objective,
     )
     n_samples = setup.cameras.viewport.width_px * setup.cameras.viewport.height_px
-    space = options.space or default_space(options.techniques, n_samples)
+    techniques, cannot = options.techniques, {}
+    if casts and setup.shadow_scene is not None:
+        # Of a group those are left out that cannot cast this scene's shadows; one that was named is refused.
+        cannot = {} if options.space else setup.shadow_scene.cannot_cast(set(techniques) - set(options.keep))
+        techniques = tuple(name for name in techniques if name not in cannot)
+    space = options.space or default_space(techniques, n_samples)
     if casts and setup.shadow_scene is not None:
         one_blending(space.configurations(), setup.shadow_scene)
     tell("measuring")
@@ -125,7 +130,8 @@ def tune(
         "gain": gain,
         "pareto": [_timed(m, options.objective) | {"error": m.error, "error_p999": m.error_p999} for m in found.pareto],
         "not_measured": [
-            {"technique": name, "reason": reason} for name, reason in (found.not_measured | found.not_explored).items()
+            {"technique": name, "reason": reason}
+            for name, reason in (cannot | found.not_measured | found.not_explored).items()
         ],
         "answers": (answered := search_answers(found, options.objective, options.seed)),
         "answer_lines": list(answer_lines(answered)),
@@ -142,7 +148,7 @@ def tune(
             for p in found.predictions
         ],
         "counts": {
-            name: dict(counts[0]) for name in space.techniques if (counts := workload.counts(configuration(name)))
+            name: dict(counts[0]) for name in space.techniques if (counts := workload.counts(space.default(name)))
         },
         "stages": _stages(found, options.objective),
         **drawn.as_json(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -101,6 +102,11 @@ class ShadowScene:
                 "triangles; use ptsv or cluster_hierarchy, or blending=opaque, with which only opaque ones cast."
             )
         return casting
+
+    def cannot_cast(self, techniques: Iterable[str]) -> dict[str, str]:
+        """Those of some techniques whose defaults cannot cast by these casters, and why not."""
+        stencils = [name for name in techniques if name in STENCIL_NAMES] if self.alpha is not None else []
+        return dict.fromkeys(stencils, "a stencil cannot cast by alpha-masked and blended triangles")
 
     @cached_property
     def rays(self) -> ShadowRays:

@@ -197,3 +197,9 @@ def test_a_file_that_is_not_text_is_refused(tmp_path):
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="is not TOML"):
         load_space(path, ALL)
+
+
+def test_what_a_space_draws_is_what_its_defaults_draw():
+    space = Space(("ptsv",), {"ptsv": {"blending": ("coloured",), "tile_px": (4, 16)}})
+    assert space.default("ptsv") == configuration("ptsv", {"blending": "coloured"})
+    assert Space(("ptsv",), {"ptsv": {"tile_px": (4,)}}).default("ptsv") == configuration("ptsv")

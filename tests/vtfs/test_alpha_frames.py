@@ -161,6 +161,7 @@ def test_a_stencil_refuses_alpha_casters_by_name_and_casts_by_opaque_ones_when_t
     one_blending([opaque, PTSV.replaced(blending="opaque")], scene)
     with pytest.raises(InputError, match="`blending` = opaque, grey: are different shadows"):
         one_blending([opaque, PTSV], scene)
+    assert list(scene.cannot_cast(["ptsv", "z_fail", "z_pass"])) == ["z_fail", "z_pass"]
     with pytest.raises(InputError, match="`z_fail`: a stencil cannot"):
         one_blending([PTSV, configuration("z_fail")], scene)
     without = floor_under_glass("opaque").shadows.scene
