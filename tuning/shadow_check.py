@@ -18,8 +18,9 @@ from vtfs.lights import Lights
 from vtfs.parameters import Configuration
 from vtfs.reference import ViewShadows, forward_reference
 from vtfs.shadow_casters import FrontFaces
-from vtfs.shadow_inputs import FrameShadows, ShadowScene
+from vtfs.shadow_inputs import FrameShadows
 from vtfs.shadow_references import brute_force, classify, kept_casters, view_points_m
+from vtfs.shadow_scene import ShadowScene
 from vtfs.view_samples import ViewSamples
 
 MOST_IN_BANDS = 1e-3

@@ -31,8 +31,8 @@ from vtfs.lights import Lights
 from vtfs.op_counts import ListLengths, OpCounts
 from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration
 from vtfs.reference import forward_reference, image_error
-from vtfs.shadow_inputs import ShadowScene
 from vtfs.shadow_maps import ShadowMaps, shadow_maps
+from vtfs.shadow_scene import ShadowScene
 from vtfs.techniques import REGISTRY
 from vtfs.view_samples import ViewSamples
 

@@ -17,7 +17,8 @@ from vtfs.light_lists import ViewLights, view_lights
 from vtfs.lights import Lights
 from vtfs.morton import morton_codes
 from vtfs.parameters import SHADOW_REFERENCES, Configuration, lists_configuration
-from vtfs.shadow_inputs import FrameShadows, ShadowScene
+from vtfs.shadow_inputs import FrameShadows
+from vtfs.shadow_scene import ShadowScene
 from vtfs.techniques import REGISTRY
 from vtfs.view_samples import ViewSamples
 

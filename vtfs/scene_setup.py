@@ -24,7 +24,7 @@ from vtfs.view_samples import Tracer, ViewSamples, trace_view_samples
 
 if TYPE_CHECKING:
     from vtfs.frame_inputs import FrameInputs
-    from vtfs.shadow_inputs import ShadowScene
+    from vtfs.shadow_scene import ShadowScene
 
 log = logging.getLogger("vtfs.scene_setup")
 
@@ -108,7 +108,7 @@ class SceneSetup:
 
         **Raises:** `InputError` for more lights that cast than there are bits.
         """
-        from vtfs.shadow_inputs import shadow_scene
+        from vtfs.shadow_scene import shadow_scene
 
         if self.scene is None:
             return None

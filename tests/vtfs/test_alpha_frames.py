@@ -24,8 +24,8 @@ from vtfs.parameters import configuration
 from vtfs.reference import ViewShadows, forward_reference, largest_relative_difference
 from vtfs.scene import AlphaMode, Material, Scene
 from vtfs.shadow_casters import BIAS
-from vtfs.shadow_inputs import shadow_scene
 from vtfs.shadow_maps import shadow_maps
+from vtfs.shadow_scene import shadow_scene
 from vtfs.view_samples import trace_view_samples
 
 PTSV = configuration("ptsv", {"branching": 8})

@@ -18,8 +18,9 @@ from vtfs.lights import Lights, point_lights
 from vtfs.parameters import SHADOW_REFERENCES, TECHNIQUES, configuration
 from vtfs.reference import ViewShadows, forward_reference, largest_relative_difference
 from vtfs.shadow_casters import Casters
-from vtfs.shadow_inputs import FrameShadows, ShadowScene, brightest_lights
+from vtfs.shadow_inputs import FrameShadows, brightest_lights
 from vtfs.shadow_maps import shadow_maps
+from vtfs.shadow_scene import ShadowScene
 from vtfs.view_samples import ViewSamples
 
 SUNS = DirectionalLights(np.array([[0.3, 1.0, 0.4], [-2.0, 0.5, 0.0]]), np.array([[1.0, 0.9, 0.7], [0.2, 0.3, 0.6]]))
