@@ -203,3 +203,11 @@ def test_public_names_are_there_and_no_others():
     assert all(callable(getattr(reports, name)) for name in reports.__all__)
     with pytest.raises(AttributeError, match="no `other`"):
         _ = reports.other
+
+
+def test_what_the_models_answer_is_said_and_only_where_there_are_models(tmp_path):
+    text = Reader(page_of(complete_run(), tmp_path / "models")).text
+    assert "What the models answer Predicted best: volume_tiled_bvh: tile_px 16 <of> 24" in text
+    files = complete_run()
+    del files.result["answer_lines"]
+    assert "What the models answer" not in Reader(page_of(files, tmp_path / "none")).text
