@@ -227,7 +227,10 @@ class SceneWorkload:
             def decided(interval_ms: tuple[float, float], slowest_low: float = slowest_low) -> bool:
                 return only_slowest and (interval_ms[0] > LOST * beat_ms or interval_ms[1] < slowest_low)
 
-            frames.append(repeats_ms(self._frame_run(config, i), decided, hopeless_ms=HOPELESS * beat_ms))
+            run = self._frame_run(config, i)
+            if frames:
+                run()  # a frame with transparent samples, where the first has none, is a program of its own
+            frames.append(repeats_ms(run, decided, hopeless_ms=HOPELESS * beat_ms))
             slowest_low = max(slowest_low, min(frames[-1]))
         # Models of stages are fitted to exact settings.
         if all(frames) and is_listed(config) and config.is_exact:
