@@ -2,6 +2,7 @@
 
 import os
 
+import jax
 import pytest
 from hypothesis import settings
 
@@ -21,3 +22,10 @@ def _own_cache(tmp_path_factory):
         del os.environ["VTFS_CACHE_DIR"]
     else:
         os.environ["VTFS_CACHE_DIR"] = before
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _programs_of_one_file():
+    """Compiled programs go with the file that made them: each takes memory maps, and Linux allows a process 65,530."""
+    yield
+    jax.clear_caches()
