@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
+from operator import itemgetter
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,20 +17,20 @@ T = TypeVar("T")
 
 
 class RunLines:
-    """A file of one JSON object a line, each with its `key`."""
+    """A file of one JSON object a line; `key`: what tells a run from the others."""
 
-    def __init__(self, path: Path):
-        self.path, self._lock = path, threading.Lock()
+    def __init__(self, path: Path, key: Callable[[dict], Hashable] = itemgetter("key")):
+        self.path, self._key, self._lock = path, key, threading.Lock()
         text = path.read_text() if path.exists() else ""
         # A run that was killed may have left half a line.
         self.lines = [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, "".join(json.dumps(line) + "\n" for line in self.lines).encode())
 
-    def known(self) -> dict[str, dict]:
+    def known(self) -> dict[Hashable, dict]:
         """The last line of each key; of those that failed none, so that they are run again."""
         with self._lock:
-            return {line["key"]: line for line in self.lines if "failed" not in line}
+            return {self._key(line): line for line in self.lines if "failed" not in line}
 
     def add(self, line: dict) -> None:
         with self._lock:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from vtfs.camera import Camera, CameraPath, Pose, Viewport, load_cameras
 from vtfs.gallery import GALLERY, build_scene
 from vtfs.scene import Material, Scene, load_scene
 from vtfs.shadow_casters import Casters, ShadowLight
-from vtfs.shadow_mask import default_bias_m, facing_samples
+from vtfs.shadow_mask import ShadowPlan, default_bias_m, facing_samples
 from vtfs.view_samples import ViewSamples, trace_view_samples
 
 LIGHT = ShadowLight((10.0, 30.0, -20.0))
@@ -57,6 +59,30 @@ def at_size(camera: Camera, size_px: int) -> Camera:
         camera.eye_m, camera.target_m, camera.up, camera.fov_y_deg, camera.near_m,
         camera.far_m if math.isfinite(camera.far_m) else 1e4, Viewport(size_px, size_px),
     )  # fmt: skip
+
+
+def with_room(plan: ShadowPlan, n_triangles: int, times: int = 1) -> ShadowPlan:
+    """A plan to size on a GPU, where memory is at hand and each step up compiles; on a CPU the plan itself.
+
+    The capacities hold all but the largest views of a million pixels; `times`: so much more.
+    """
+    if jax.default_backend() == "cpu":
+        return plan
+    groups = max(times * 2**19, 2 * n_triangles)
+    return replace(plan, groups=groups, leaf_groups=times * 2**22, pairs=times * 2**21 if plan.passes == 2 else 0)
+
+
+def scene_arguments(description: str | None, minutes: float) -> argparse.ArgumentParser:
+    """What benchmarks of several scenes take: SCENE[,SCENE...], `named_case`, for so many minutes."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--scenes", type=Path)
+    parser.add_argument("--triangles", type=int, default=60_000)
+    parser.add_argument("--size", type=int, default=1024)
+    parser.add_argument("--minutes", type=float, default=minutes)
+    parser.add_argument("--workers", type=int, default=1)
+    return parser
 
 
 @dataclass(frozen=True)

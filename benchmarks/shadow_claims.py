@@ -13,19 +13,18 @@ why. DIR/shadow-claims-SCENE-SIZE.md is the table of what is known.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import os
 import threading
 import time
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import jax
 import numpy as np
 
 from benchmarks.run_lines import RunLines, side_by_side, why
-from benchmarks.shadow_cases import Case, named_case
+from benchmarks.shadow_cases import Case, named_case, scene_arguments, with_room
 from vtfs.device import device_name, keep_compiled_programs
 from vtfs.files import write_atomically
 from vtfs.shadow_casters import FrontFaces
@@ -102,9 +101,6 @@ CLAIMS = (
     Claim("clusters: without feedback over with it (ours)", CLUSTERS, of(CLUSTERS, plan=FEEDBACK), 1, np.inf),
 )  # fmt: skip
 
-GROUPS, LEAF_GROUPS, PAIRS = 2**20, 2**23, 2**22
-"""Of a GPU: memory is at hand there, and each step up compiles."""
-
 
 def counted(run: Run, case: Case, one_at_once: threading.Lock) -> dict[str, float]:
     """Counts of a run; `one_at_once` holds what runs on the device."""
@@ -114,11 +110,9 @@ def counted(run: Run, case: Case, one_at_once: threading.Lock) -> dict[str, floa
     frame = shadow_frame(
         case.samples, casters, case.light, grid, case.bias_m, case.receives, front_faces=run.front_faces
     )
-    if jax.default_backend() != "cpu":
-        n_pairs = PAIRS if plan.passes == 2 else 0
-        groups = max(GROUPS, 2 * case.casters.n_triangles)
-        leaf_groups = LEAF_GROUPS if run.technique in ("ptsv", "cluster_hierarchy") else 4 * LEAF_GROUPS
-        plan = replace(plan, groups=groups, leaf_groups=leaf_groups, pairs=n_pairs)
+    plan = with_room(plan, case.casters.n_triangles, times=2)
+    if jax.default_backend() != "cpu" and run.technique in ("z_pass", "z_fail"):
+        plan = replace(plan, leaf_groups=4 * plan.leaf_groups)
 
     def one(plan: ShadowPlan, _: int) -> ShadowMask:
         with one_at_once:
@@ -132,7 +126,7 @@ def counted(run: Run, case: Case, one_at_once: threading.Lock) -> dict[str, floa
     return {**counts, "work": work}
 
 
-def table(scene: str, known: dict[str, dict], n_frames: int, failed: dict[str, str]) -> str:
+def table(scene: str, known: Mapping[Hashable, dict], n_frames: int, failed: dict[str, str]) -> str:
     """What is claimed and what was counted, in Markdown."""
     rows = [f"{scene}", "", "| claim | papers | here | counts | |", "| --- | --- | --- | --- | --- |"]
     for claim in CLAIMS:
@@ -165,16 +159,9 @@ def path_runs(n_frames: int) -> list[Run]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--scenes", type=Path)
-    parser.add_argument("--triangles", type=int, default=60_000)
+    parser = scene_arguments(__doc__, minutes=20.0)
     parser.add_argument("--frames", type=int, default=8)
-    parser.add_argument("--size", type=int, default=1024)
     parser.add_argument("--large", type=int, default=4096)
-    parser.add_argument("--minutes", type=float, default=20.0)
-    parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     end = time.monotonic() + 60 * given.minutes
     keep_compiled_programs()

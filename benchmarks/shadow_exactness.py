@@ -24,7 +24,7 @@ import queue
 import threading
 import time
 import traceback
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ import jax
 import numpy as np
 
 from benchmarks.closed_sphere import all_spheres
+from benchmarks.run_lines import RunLines
+from benchmarks.shadow_cases import with_room
 from benchmarks.shadow_variants import Variant, one_at_a_time, pairwise, unrolled, variant
 from benchmarks.shadow_views import LIGHTS, Subject, View
 from vtfs.camera import Viewport
@@ -40,9 +42,6 @@ from vtfs.files import write_atomically
 from vtfs.gbuffer import from_runs
 from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
 from vtfs.shadow_techniques import counting_program, fitted_to_all, shadow_sizes
-
-FIRST_GROUPS, FIRST_LEAF_GROUPS, FIRST_PAIRS = 2**19, 2**22, 2**21
-"""Capacities that hold all but the largest views at 1280x720."""
 
 log = logging.getLogger("benchmarks.shadow_exactness")
 
@@ -59,11 +58,7 @@ class Walker:
     compile_s: float = 0.0
 
     def __post_init__(self) -> None:
-        self.plan = self.variant.plan
-        if jax.default_backend() != "cpu":  # memory is at hand there, and each step up compiles
-            n_pairs = FIRST_PAIRS if self.plan.passes == 2 else 0
-            groups = max(FIRST_GROUPS, 2 * self.n_padded)
-            self.plan = replace(self.plan, groups=groups, leaf_groups=FIRST_LEAF_GROUPS, pairs=n_pairs)
+        self.plan = with_room(self.variant.plan, self.n_padded)
 
     def mask(self, view: View) -> np.ndarray:
         """The mask of a view, bool `[h, w]`."""
@@ -89,29 +84,8 @@ class Walker:
                 return jax.block_until_ready(self.compiled[plan](frame))
 
 
-class Results:
-    """Lines of a file; those of an earlier run are kept."""
-
-    def __init__(self, path: Path):
-        self._path, self._lock = path, threading.Lock()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        text = path.read_text() if path.exists() else ""
-        # A run that was killed may have left half a line.
-        self.lines = [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
-        write_atomically(path, "".join(json.dumps(line) + "\n" for line in self.lines).encode())
-
-    def has(self, *key: object) -> bool:
-        with self._lock:
-            return any(_key(line) == key for line in self.lines if "failed" not in line)
-
-    def add(self, line: dict) -> None:
-        with self._lock, self._path.open("a") as file:
-            file.write(json.dumps(line) + "\n")
-            self.lines.append(line)
-        print(" ".join(f"{name}={value}" for name, value in line.items() if name not in ("device", "jax")), flush=True)
-
-
-def _key(line: dict) -> tuple:
+def key_of(line: dict) -> tuple:
+    """A line is a variant on one view."""
     return line["scene"], line["frame"], line["light"], line["variant"]
 
 
@@ -122,7 +96,7 @@ class Campaign:
     subjects: list[Subject]
     n_frames: int
     n_lights: int
-    results: Results
+    results: RunLines
     end: float
     about: dict[str, str]
 
@@ -146,7 +120,7 @@ class Campaign:
             if time.monotonic() > self.end:
                 return False
             key = (subject.name, frame, light, walker.variant.name)
-            if self.results.has(*key):
+            if key in self.results.known():
                 continue
             line = dict(zip(("scene", "frame", "light", "variant"), key, strict=True)) | self.about
             try:
@@ -159,13 +133,14 @@ class Campaign:
                 log.debug("%s", traceback.format_exc())
                 line |= {"failed": f"{type(error).__name__}: {error}"[:300]}
             self.results.add(line)
+            print(" ".join(f"{k}={v}" for k, v in line.items() if k not in ("device", "jax")), flush=True)
         return True
 
 
 def total(lines: list[dict]) -> dict[str, Any]:
     """Over all lines: what was compared, and the worst share of the bands of any line."""
     judged = _judged(lines)
-    known = {_key(line) for line in judged}
+    known = {key_of(line) for line in judged}
     names = (
         "samples", "shadowed", "by_itself", "differs", "own_plane", "near_edge", "near_plane", "errors",
         "not_classified",
@@ -173,18 +148,18 @@ def total(lines: list[dict]) -> dict[str, Any]:
     worst = max(judged, key=in_bands, default=None)
     return {
         "masks": len(judged),
-        "failed": len({_key(line) for line in lines} - known),
+        "failed": len({key_of(line) for line in lines} - known),
         "scenes": len({line["scene"] for line in judged}),
         "views": len({(line["scene"], line["frame"], line["light"]) for line in judged}),
         "variants": len({line["variant"] for line in judged}),
         **{name: sum(line[name] for line in judged) for name in names},
         "most_in_bands": in_bands(worst) if worst else 0.0,
-        "most_in_bands_at": _key(worst) if worst else None,
+        "most_in_bands_at": key_of(worst) if worst else None,
     }
 
 
 def _judged(lines: list[dict]) -> list[dict]:
-    return list({_key(line): line for line in lines if "failed" not in line}.values())
+    return list({key_of(line): line for line in lines if "failed" not in line}.values())
 
 
 def table(lines: list[dict]) -> str:
@@ -253,7 +228,7 @@ def main() -> None:
     n_masks += 2 * len(subjects)
     print(f"{device_name()}: {len(looped)} programs, {len(timed)} unrolled, {n_masks:,} masks", flush=True)
     about = {"device": device_name(), "jax": jax.__version__}
-    results = Results(given.out / "shadow-exactness.jsonl")
+    results = RunLines(given.out / "shadow-exactness.jsonl", key_of)
     campaign = Campaign(subjects, given.frames, given.lights, results, end, about)
     threads = [threading.Thread(target=campaign.work, args=(rounds,), daemon=True) for _ in range(given.workers)]
     for thread in threads:

@@ -13,19 +13,17 @@ again. Tables and charts of it: `python -m benchmarks.shadow_tradeoff_charts`.
 
 from __future__ import annotations
 
-import argparse
 import os
 import threading
 import time
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import jax
 import numpy as np
 
 from benchmarks.run_lines import RunLines, side_by_side, why
-from benchmarks.shadow_cases import Case, named_case
+from benchmarks.shadow_cases import Case, named_case, scene_arguments, with_room
 from benchmarks.shadows import embree, times_ms
 from vtfs.device import device_name, keep_compiled_programs, versions
 from vtfs.gbuffer import from_runs
@@ -35,8 +33,6 @@ from vtfs.shadow_techniques import fitted_to_all, run_program, shadow_counts, sh
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
 
 BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (4, 16, 2, 32)
-GROUPS, LEAF_GROUPS, PAIRS = 2**19, 2**22, 2**21
-"""Of sizing runs on a GPU: memory is at hand there, and each step up compiles."""
 
 
 @dataclass(frozen=True)
@@ -116,10 +112,7 @@ def prepare(key: str, subject: Subject, variant: Variant, one_at_once: threading
         depth_slices = 2**KEY_BITS
         grid = shadow_grid(case.samples, plan.tile_px, depth_slices)
     frame = shadow_frame(case.samples, subject.casters, case.light, grid, case.bias_m, case.receives)
-    if jax.default_backend() != "cpu":
-        n_pairs = PAIRS if plan.passes == 2 else 0
-        groups = max(GROUPS, 2 * case.casters.n_triangles)
-        plan = replace(plan, groups=groups, leaf_groups=LEAF_GROUPS, pairs=n_pairs)
+    plan = with_room(plan, case.casters.n_triangles)
 
     def run(plan: ShadowPlan, _: int) -> ShadowMask:
         with one_at_once:
@@ -187,15 +180,8 @@ def time_all(ready: list[Ready], seconds: float, lines: RunLines) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--scenes", type=Path)
-    parser.add_argument("--triangles", type=int, default=60_000)
+    parser = scene_arguments(__doc__, minutes=8.0)
     parser.add_argument("--along", type=float, default=0.0)
-    parser.add_argument("--size", type=int, default=1024)
-    parser.add_argument("--minutes", type=float, default=8.0)
-    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--only", choices=list(GROUPED))
     given = parser.parse_args()
     started = time.monotonic()

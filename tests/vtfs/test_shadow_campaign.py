@@ -8,7 +8,8 @@ import threading
 
 import numpy as np
 
-from benchmarks.shadow_exactness import Results, Walker, table, total
+from benchmarks.run_lines import RunLines
+from benchmarks.shadow_exactness import Walker, key_of, table, total
 from benchmarks.shadow_variants import VALUES, exists, one_at_a_time, pairwise, unrolled, variant
 from benchmarks.shadow_views import LIGHTS, Subject
 from vtfs.camera import Viewport
@@ -66,13 +67,13 @@ def test_lines_are_kept_and_a_run_goes_on(tmp_path):
         "shadowed": 10, "by_itself": 0, "differs": 2, "own_plane": 0, "near_edge": 1, "near_plane": 1,
         "errors": 0, "not_classified": 0,
     }  # fmt: skip
-    results = Results(path)
+    results = RunLines(path, key_of)
     results.add({"scene": "a", "frame": 0, "light": "above", "variant": "v", "failed": "out of memory"})
     results.add(line)
     with path.open("a") as file:
         file.write(json.dumps(line)[:20])  # as a run that was killed leaves it
-    again = Results(path)
-    assert again.has("a", 0, "inside", "v") and not again.has("a", 0, "above", "v")
+    again = RunLines(path, key_of)
+    assert ("a", 0, "inside", "v") in again.known() and ("a", 0, "above", "v") not in again.known()
     found = total(again.lines)
     assert (found["masks"], found["failed"], found["samples"], found["most_in_bands"]) == (1, 1, 1_000, 0.002)
     again.add({**line, "light": "above"})
