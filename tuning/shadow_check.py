@@ -10,6 +10,8 @@ import numpy as np
 
 from vtfs.alpha_casters import Blending, Casting
 from vtfs.cache import cached
+from vtfs.frame import image_on_host
+from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.layers import Layers, TransparentLayer
@@ -105,17 +107,14 @@ class ShadowChecker:
 
         - `left`: what alpha casters leave of each light, `[h, w, channels]`; compared with float64 on some samples.
         """
-        casting = self._shadows.blending(config)
+        casting = self._shadows.scene.blending(config)
         if casting != "opaque":
             wrong = self._wrong_light(casting, masks, left)
-            if casting not in self._left:
-                channels = np.array(left, np.float64).reshape(len(self._shadows.views), -1, *left[0].shape)
-                if wrong:
-                    return MaskCheck(
-                        wrong,
-                        forward_reference(self._samples, self._lights, self._of_views(self.masks("cast"), channels)),
-                    )
-                self._left[casting] = channels
+            channels = np.array(left, np.float64).reshape(len(self._shadows.views), -1, *left[0].shape)
+            if wrong and casting not in self._left:  # no light is known to be right: the image is of what was found
+                of_views = self._of_views(self.masks("cast"), channels)
+                return MaskCheck(wrong, forward_reference(self._samples, self._lights, of_views))
+            self._left.setdefault(casting, channels)
             if wrong:
                 return MaskCheck(wrong, self.image(casting))
         shadows = self._shadows
@@ -226,11 +225,9 @@ def one_blending(configurations: Sequence[Configuration], scene: ShadowScene) ->
         )
 
 
-def light_on_host(masks: Sequence[CastMask], samples: ViewSamples) -> list[np.ndarray]:
+def light_on_host(masks: Sequence[CastMask], inputs: FrameInputs) -> list[np.ndarray]:
     """What alpha casters leave by `CastMask`s, `[h, w, channels]`; none where none cast."""
-    viewport = samples.camera.viewport
-    channels = [[from_runs(np.asarray(channel), viewport) for channel in mask.transmittance] for mask in masks]
-    return [np.stack(own, axis=-1) for own in channels if own]
+    return [image_on_host(mask.transmittance, inputs) for mask in masks if mask.transmittance]
 
 
 def masks_on_host(masks: Sequence[CastMask], samples: ViewSamples) -> list[np.ndarray]:

@@ -244,7 +244,7 @@ class SceneWorkload:
             key = (self.scene_key, f"frame {self.frames[0]}")
             self._checker = ShadowChecker(shadows, samples, self._path.lights, key)
         masks = cast_program(config.technique, planned(config, self._sizes_of(config)))(shadows.tasks(config))
-        return self._checker.check(config, masks_on_host(masks, samples), light_on_host(masks, samples))
+        return self._checker.check(config, masks_on_host(masks, samples), light_on_host(masks, self._inputs[0]))
 
     def _stages_ms(
         self, config: Configuration, sizes: Sizes, env: dict[str, Any]

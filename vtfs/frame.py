@@ -66,7 +66,7 @@ def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
     elif stage == "approximate":
         env["assign"], env["cluster_light"] = result
     elif stage == "shadow_merge":
-        env["shadow_merge"] = [CastMask(mask.shadowed, mask.overflowed) for mask in result]
+        env["shadow_merge"] = [_cast_mask(mask) for mask in result]
         env["shadow_masks"] = env["shadow_merge"]
     elif stage == TRANSMIT:
         env["shadow_masks"] = [mask for mask, _ in result]
@@ -94,6 +94,10 @@ def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable
     return run
 
 
+def _cast_mask(mask: ShadowMask) -> CastMask:
+    return CastMask(mask.shadowed, mask.overflowed)
+
+
 def cast_program(technique: str, plan: Plan) -> Callable[[list[ShadowTask]], list[CastMask]]:
     """From view samples to the mask of one light on one view, fused, and run for each of them."""
     casting = tuple(stage for stage in REGISTRY[technique].stages_of(plan, False) if stage.casting)
@@ -108,8 +112,7 @@ def _fused_casting(stages: tuple[Stage, ...], plan: Plan) -> Callable[[ShadowTas
             env[stage.name] = stage.run(stage.narrowed(plan), *(env[name] for name in stage.needs))
         if stages[-1].name == TRANSMIT:
             return env[TRANSMIT][0]
-        mask = env[stages[-1].name]
-        return CastMask(mask.shadowed, mask.overflowed)  # alone, so that XLA deletes the counting
+        return _cast_mask(env[stages[-1].name])  # alone, so that XLA deletes the counting
 
     return jax.jit(run)
 
@@ -233,7 +236,7 @@ def cast_counted(config: Configuration, inputs: FrameInputs) -> CastFrame:
     if tasks[0].alpha is None:
         return CastFrame(opaque, shadow_sizes(plan), [], [], ())
     transmit = all_stages[-1]
-    cast = [CastMask(mask.shadowed, mask.overflowed) for mask in masks]
+    cast = [_cast_mask(mask) for mask in masks]
     left: dict[int, CastMask] = {}
 
     def run_alpha(plan: ShadowPlan, i: int) -> ShadowMask:

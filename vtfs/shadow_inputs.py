@@ -164,9 +164,6 @@ class FrameShadows:
         positions = [own.positions() for own in fragments]
         return tuple((own, part.gbuffer(own, "float32").normal) for part, own in zip(fragments, positions, strict=True))
 
-    def blending(self, config: Configuration) -> Casting:
-        return self.scene.blending(config)
-
     def _alpha_task(self, casting: Casting, view: int, slot: int) -> AlphaTask | None:
         if casting == "opaque":
             return None
@@ -180,9 +177,9 @@ class FrameShadows:
     def tasks(self, config: Configuration) -> list[ShadowTask]:
         """For each view the tasks of all slots.
 
-        **Raises:** `InputError`, see `blending`.
+        **Raises:** `InputError`, see `ShadowScene.blending`.
         """
-        casting = self.blending(config)
+        casting = self.scene.blending(config)
         params = config.params
         camera = self.views[0].camera
         grid = grid_of(camera, self._deepest_m, int(params["tile_px"]), int(params.get("depth_slices", 0)))
@@ -198,7 +195,7 @@ class FrameShadows:
     def reference_masks(self, config: Configuration) -> list[CastMask]:
         """Masks of a reference technique, in the order of `tasks`, in runs."""
         front_faces: FrontFaces = config["front_faces"]  # type: ignore[assignment]
-        casting = self.blending(config)
+        casting = self.scene.blending(config)
         masks = []
         for v, view in enumerate(self.views):
             for k in range(len(self.lights)):

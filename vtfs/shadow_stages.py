@@ -50,11 +50,9 @@ def casting_stages(technique: str) -> tuple[CastingStage, ...]:
     """The stages of opaque casters, and of techniques that have it the one of alpha casters."""
     if technique in _FAILING:
         return _opaque_stages(technique)
-    of_plan = ("tile_px", "bounds", "extra", "tree", "blending", *_WALKED)
+    of_plan = ("tile_px", "bounds", "tree", "blending", *_WALKED)
     needs = ("shadow_tasks", "shadow_merge")
-    alpha = CastingStage(
-        TRANSMIT, functools.partial(_transmit, technique), needs, tuple(dict.fromkeys(of_plan)), of_alpha=True
-    )
+    alpha = CastingStage(TRANSMIT, functools.partial(_transmit, technique), needs, of_plan, of_alpha=True)
     return (*_opaque_stages(technique), alpha)
 
 

@@ -360,13 +360,13 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
 
 
 _OF_ALPHA = {
-    "samples": "alpha_samples",
+    "shadow_samples": "alpha_samples",
     "casters": "alpha_casters",
-    "items": "alpha_clusters",
+    "shadow_clusters": "alpha_clusters",
     "node_tests": "alpha_node_tests",
     "sample_tests": "alpha_sample_tests",
     "listed_pairs": "alpha_listed_pairs",
-    "longest_list": "longest_alpha_list",
+    "longest_shadow_list": "longest_alpha_list",
 }
 
 
@@ -385,11 +385,8 @@ def shadows_counts(of_each: Sequence[dict[str, int]], of_alpha: Sequence[dict[st
         alpha = _shadows_counts(of_alpha)
         for name in ("test_and_set", "test_and_set_in_cluster", "memory"):
             both[name] += alpha[name]
-        both |= {own: alpha[_SHADOW_NAMES.get(name, name)] for name, own in _OF_ALPHA.items()}
+        both |= {own: alpha[name] for name, own in _OF_ALPHA.items()}
     return both
-
-
-_SHADOW_NAMES = {"samples": "shadow_samples", "items": "shadow_clusters", "longest_list": "longest_shadow_list"}
 
 
 def _shadows_counts(of_each: Sequence[dict[str, int]]) -> dict[str, int]:
@@ -398,7 +395,8 @@ def _shadows_counts(of_each: Sequence[dict[str, int]]) -> dict[str, int]:
         name: (max if name in largest else sum)(counts.get(name, 0) for counts in of_each)
         for name in dict.fromkeys(name for counts in of_each for name in counts)
     }
-    return {_SHADOW_NAMES.get(name, name): value for name, value in total.items()}
+    names = {"samples": "shadow_samples", "items": "shadow_clusters", "longest_list": "longest_shadow_list"}
+    return {names.get(name, name): value for name, value in total.items()}
 
 
 def _memory(plan: ShadowPlan, frame: ShadowFrame) -> int:

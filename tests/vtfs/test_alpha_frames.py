@@ -114,7 +114,7 @@ def test_a_conservatory_is_lit_as_float64_says_panes_too(blending):
 def cast(inputs: FrameInputs, config):
     sizes = run_stages(config, inputs, until="assign")[1]
     masks = cast_program(config.technique, planned(config, sizes))(inputs.shadows.tasks(config))
-    return masks_on_host(masks, inputs.samples), light_on_host(masks, inputs.samples)
+    return masks_on_host(masks, inputs.samples), light_on_host(masks, inputs)
 
 
 def test_the_check_passes_what_is_right_and_finds_light_that_is_not():
