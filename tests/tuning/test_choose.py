@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate, stats
 
+from tests.tuning.measurements import a_measurement
 from tests.tuning.test_sweep import LARGE, SHADING_BOUND, SMALL, WHOLE, Synthetic, erratic
 from tuning.choose import (
     choose_next,
@@ -26,22 +27,7 @@ from vtfs.parameters import configuration
 
 
 def measurement(*frames_ms, error=None, outcome: Outcome = "timed") -> Measurement:
-    return Measurement(
-        technique="forward",
-        params={},
-        scene_key="",
-        frames=tuple(range(len(frames_ms))),
-        seed=0,
-        outcome=outcome,
-        compile_s=0.0,
-        stages_ms={"frame": tuple(frames_ms)},
-        counts=({},) * len(frames_ms),
-        error=error,
-        error_p999=None,
-        device="",
-        versions={},
-        load=0.0,
-    )
+    return a_measurement(n_frames=len(frames_ms), outcome=outcome, stages_ms={"frame": tuple(frames_ms)}, error=error)
 
 
 def test_the_slowest_frame_or_the_mean_decides():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from tests.tuning.measurements import a_measurement
 from tuning.features import STAGE_TERMS
 from tuning.measurement import Measurement, Outcome
 from tuning.stage_models import fit_models, fit_stage
@@ -14,22 +15,8 @@ from tuning.stage_models import fit_models, fit_stage
 def measurement(
     counts, frames_ms, outcome: Outcome = "timed", stage="frame", technique="tiled_deferred"
 ) -> Measurement:
-    return Measurement(
-        technique=technique,
-        params={},
-        scene_key="",
-        frames=tuple(range(len(counts))),
-        seed=0,
-        outcome=outcome,
-        compile_s=0.0,
-        stages_ms={stage: tuple(tuple(repeats) for repeats in frames_ms)},
-        counts=tuple(counts),
-        error=None,
-        error_p999=None,
-        device="",
-        versions={},
-        load=0.0,
-    )
+    stages_ms = {stage: tuple(tuple(repeats) for repeats in frames_ms)}
+    return a_measurement(technique, len(counts), outcome=outcome, stages_ms=stages_ms, counts=tuple(counts))
 
 
 DRAWN = ("cells_total", "clusters_occupied", "tree_tests", "lighting_computations")
