@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from tuning.budget_lines import asked_sizes, frame_keys, is_size, sizes_within
+from tuning.budget_lines import SizesWithin, asked_sizes, frame_keys, is_size
 from tuning.family import LIGHTS, TILES
 from tuning.questions import BUDGETS_MS, Answer, best_configuration, crossover, sensitivities
 from tuning.table_model import FRAME, TableModel
@@ -25,18 +25,19 @@ _LEAST_SLOPE = 0.01
 Answers = dict[str, list[dict[str, Any]]]
 
 
-def answers(model: TableModel, table: TimingTable, seed: int = 0) -> Answers:
+def answers(model: TableModel, sizes: Sequence[SizesWithin], table: TimingTable, seed: int = 0) -> Answers:
     """Records under `within`, `crossovers`, `matters`, `best` and `influential`; sizes that do not exist are null.
 
     **Arguments:**
 
+    - `sizes`: `sizes_within(model)`.
     - `table`: what the models were fitted to, and the parameters of its rows, also those that explain nothing.
     """
     rows = {key: _rows(model, table, key) for key in frame_keys(model)}
     return {
         "within": [
             {"labels": _labels(model, one.key), "column": one.column, "budget_ms": budget_ms, **_answer(found)}
-            for one in sizes_within(model)
+            for one in sizes
             for budget_ms, found in zip(BUDGETS_MS, one.within, strict=True)
         ],
         "crossovers": list(_crossovers(model, table, rows, seed)),

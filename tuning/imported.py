@@ -69,7 +69,8 @@ def tune_imported(
     table = _table(imported)
     model = fit_groups(table, seed)
     with_settings = replace(table, columns=table.columns | _settings(_timed_rows(imported)))
-    answered = answers(model, with_settings, seed)
+    sizes = tuple(sizes_within(model))
+    answered = answers(model, sizes, with_settings, seed)
     predicted = _predicted(imported, model, objective)
     fastest = min(exact, key=lambda c: time_ms(measurements[c], objective))
     fastest_ms = time_ms(measurements[fastest], objective)
@@ -119,7 +120,7 @@ def tune_imported(
             if e.interval_ms[0] < fastest_ms
         ][:_NEXT],
         "answers": answered,
-        "answer_lines": [*(one.line for one in sizes_within(model)), *answer_lines(answered)],
+        "answer_lines": [*(one.line for one in sizes), *answer_lines(answered)],
         "cost_models": _cost_models(model),
         "predictions": [_prediction(e, measurements, objective) for e in predicted.values()],
         "counts": {

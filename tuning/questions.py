@@ -136,8 +136,13 @@ def best_configuration(
     if configuration is not None:
         means = np.eye(int(configuration.max()) + 1)[configuration] / np.bincount(configuration)
         times_ms, sampled = times_ms @ means, sampled @ means
+    return fastest_of(times_ms, sampled)
+
+
+def fastest_of(times_ms: np.ndarray, sampled_ms: np.ndarray) -> Choice:
+    """The choice by predicted times `[configurations]`; `sampled_ms`, `[samples, configurations]`, is what may be."""
     row = int(times_ms.argmin())
-    regret = sampled[:, row] / sampled.min(axis=1) - 1
+    regret = sampled_ms[:, row] / sampled_ms.min(axis=1) - 1
     return Choice(row, float(times_ms[row]), float(regret.mean()), float(np.quantile(regret, 0.95)))
 
 

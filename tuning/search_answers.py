@@ -15,6 +15,7 @@ from tuning.choose import Objective, is_timed, time_ms
 from tuning.cost_model import CostModel
 from tuning.features import operations
 from tuning.measurement import Measurement
+from tuning.questions import fastest_of
 from tuning.sweep import Prediction, SearchResult
 from vtfs.parameters import Value, configuration
 
@@ -66,17 +67,16 @@ def _best(predictions: tuple[Prediction, ...], models: dict[str, CostModel], see
     spread = np.array([models[p.configuration.technique].spread for p in predictions]) * unsure
     moved = np.random.default_rng(seed).normal(size=(_SAMPLES, len(predictions)))
     sampled = expected * np.exp(spread * moved)
-    row = int(expected.argmin())
-    regret = sampled[:, row] / sampled.min(axis=1) - 1
-    chosen = predictions[row].configuration
+    best = fastest_of(expected, sampled)
+    chosen = predictions[best.row].configuration
     alike = [p.configuration.params for p in predictions if p.configuration.technique == chosen.technique]
     return [
         {
             "labels": {"technique": chosen.technique},
             "params": {name: chosen.params[name] for name in _varying(alike)},
-            "time_ms": float(expected[row]),
-            "expected_regret": float(regret.mean()),
-            "worst_regret": float(np.quantile(regret, 0.95)),
+            "time_ms": best.time_ms,
+            "expected_regret": best.expected_regret,
+            "worst_regret": best.worst_regret,
             "of": len(predictions),
         }
     ]

@@ -69,20 +69,20 @@ def tune(
     casts = casts_shadows(options.techniques)
     frames = choose_frames(setup, DEFAULT_SHADOWS if casts else DEFAULT_CONFIGURATION)
     samples = tuple(setup.samples(f) for f in frames)
+    shadow_scene = setup.shadow_scene if casts else None
     workload = SceneWorkload(
-        ScenePath(setup.key, frames, samples, setup.lights, options.seed, setup.shadow_scene if casts else None),
+        ScenePath(setup.key, frames, samples, setup.lights, options.seed, shadow_scene),
         compiles,
         options.objective,
     )
     n_samples = setup.cameras.viewport.width_px * setup.cameras.viewport.height_px
-    techniques, cannot = options.techniques, {}
-    if casts and setup.shadow_scene is not None:
+    cannot = {}
+    if shadow_scene is not None and not options.space:
         # Of a group those are left out that cannot cast this scene's shadows; one that was named is refused.
-        cannot = {} if options.space else setup.shadow_scene.cannot_cast(set(techniques) - set(options.keep))
-        techniques = tuple(name for name in techniques if name not in cannot)
-    space = options.space or default_space(techniques, n_samples)
-    if casts and setup.shadow_scene is not None:
-        one_blending(space.configurations(), setup.shadow_scene)
+        cannot = shadow_scene.cannot_cast(name for name in options.techniques if name not in options.keep)
+    space = options.space or default_space([name for name in options.techniques if name not in cannot], n_samples)
+    if shadow_scene is not None:
+        one_blending(space.configurations(), shadow_scene)
     tell("measuring")
     found = search(
         space,

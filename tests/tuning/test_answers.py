@@ -5,12 +5,18 @@ import json
 import numpy as np
 import pytest
 
-from tuning.answers import answer_lines, answers
+from tuning.answers import Answers, answer_lines, answers
+from tuning.budget_lines import sizes_within
 from tuning.label_groups import fit_groups
+from tuning.table_model import TableModel
 from tuning.timing_table import TimingTable
 
 NOISE = 0.005
 LIGHTS = np.geomspace(64, 65536, 14)
+
+
+def asked(model: TableModel, table: TimingTable) -> Answers:
+    return answers(model, tuple(sizes_within(model)), table)
 
 
 def two_lines() -> TimingTable:
@@ -25,7 +31,7 @@ def two_lines() -> TimingTable:
 @pytest.fixture(scope="module")
 def of_lines():
     table = two_lines()
-    return answers(fit_groups(table), table)
+    return asked(fit_groups(table), table)
 
 
 def test_two_techniques_cross_where_their_laws_do(of_lines):
@@ -73,7 +79,7 @@ def test_techniques_that_never_cross_have_no_crossover():
     table = two_lines()
     forward = table.repeats_ms[: len(LIGHTS)]
     slower = TimingTable(table.columns, table.labels, (*forward, *((9 * ms,) for (ms,) in forward)))
-    (found,) = answers(fit_groups(slower), slower)["crossovers"]
+    (found,) = asked(fit_groups(slower), slower)["crossovers"]
     assert found["value"] is None
     assert not any(line.startswith("Where another") for line in answer_lines({**EMPTY, "crossovers": [found]}))
 
@@ -91,7 +97,7 @@ def test_the_best_tile_is_at_the_minimum_of_its_law(n_repeats):
         (ms * np.exp(NOISE * rng.normal()), ms * np.exp(NOISE * rng.normal())) for ms in np.tile(law, n_repeats)
     )
     table = TimingTable({"tile_px": np.tile(tiles, n_repeats)}, {}, repeats)
-    (best,) = answers(fit_groups(table), table)["best"]
+    (best,) = asked(fit_groups(table), table)["best"]
     assert best["params"]["tile_px"] in (32.0, 40.0, 48.0)  # one step about the minimum
     assert best["of"] == len(tiles)
     assert best["time_ms"] == pytest.approx(law.min(), rel=0.03)
@@ -113,22 +119,22 @@ def test_frames_of_a_setting_are_taken_together():
     )
     whole = TimingTable(columns, {}, times)
     counted = TimingTable({"lighting_computations": columns["lighting_computations"]}, {}, times)
-    (best,) = answers(fit_groups(counted), whole)["best"]
+    (best,) = asked(fit_groups(counted), whole)["best"]
     assert best["params"] == {"tile_px": 16.0}
     assert best["time_ms"] == pytest.approx(1 + 2e-6 * 2.5e6, rel=0.02)  # the mean of its two frames
     assert best["of"] == 5
     unequal = TimingTable({n: c[:-1] for n, c in columns.items()}, {}, times[:-1])
-    assert answers(fit_groups(counted), unequal)["best"] == []  # one setting was timed on one frame only
+    assert asked(fit_groups(counted), unequal)["best"] == []  # one setting was timed on one frame only
 
 
 def test_a_constant_prefers_no_setting_and_a_single_row_moves_nothing_else():
     rng = np.random.default_rng(3)
     tiles = np.array([8.0, 16, 24, 32, 48, 64])
     table = TimingTable({"tile_px": tiles}, {}, tuple((ms,) for ms in 5 * np.exp(0.05 * rng.normal(size=6))))
-    found = answers(fit_groups(table), table)
+    found = asked(fit_groups(table), table)
     assert found["best"] == found["matters"] == []
     one = TimingTable({"tile_px": tiles[:1]}, {}, ((5.0, 5.1),))
-    assert answers(fit_groups(one), one) == EMPTY
+    assert asked(fit_groups(one), one) == EMPTY
 
 
 def test_labels_are_named_where_they_tell_records_apart(of_lines):

@@ -53,6 +53,7 @@ def fit(
         raise InputError(f"--published {published}: goes without DATA ({data}); leave one of them out.")
     layout = parsed_layout(time, unit, map_file, ignore)
     from tuning.answers import answer_lines, answers
+    from tuning.budget_lines import sizes_within
     from tuning.formats.grouping import without
     from tuning.formats.registry import read_table
     from tuning.label_groups import fit_groups
@@ -80,18 +81,18 @@ def fit(
         status.say(f"fitting {len(table)} rows")
         model = fit_groups(table, seed)
         status.say("asking what the models say")
-        found = answers(model, whole, seed)
+        sizes = tuple(sizes_within(model))
+        found = answers(model, sizes, whole, seed)
     write_json(json_file, model.as_json() | {"fitted_to": source, "answers": found})
     if json_file == "-":
         return
-    from tuning.budget_lines import sizes_within
     from tuning.model_table import print_models
 
     print(f"{source}: {len(table)} rows, {len(model.models)} {'model' if len(model.models) == 1 else 'models'}")
     for note in notes:
         print(note)
     print_models(model)
-    for line in (*(one.line for one in sizes_within(model)), *answer_lines(found)):
+    for line in (*(one.line for one in sizes), *answer_lines(found)):
         print(line)
     if json_file:
         print(f"Model: {json_file}")
