@@ -88,7 +88,7 @@ def descend(at: AtLevel, first: int, last: int, volume: Volumes, hierarchy: Hier
         n_children = n_parents * b
         offset = jnp.asarray(table.first_child)[level]
         was = jax.lax.dynamic_slice_in_dim(at.shadowed, offset, n_children)
-        parent = jnp.repeat(at.in_shadow[:n_parents], b, total_repeat_length=n_children)
+        parent = _for_each_child(at.in_shadow[:n_parents], b)
 
         def drop(accepted):
             return accepted | parent | was if plan.feedback else jnp.zeros_like(accepted)
@@ -100,7 +100,7 @@ def descend(at: AtLevel, first: int, last: int, volume: Volumes, hierarchy: Hier
         now = parent | (done.accepts > 0) | was
         own = jnp.arange(n_children, dtype=jnp.int32) < jnp.asarray((*levels[1:], levels[-1] * b), jnp.int32)[level]
         shadowed = jax.lax.dynamic_update_slice_in_dim(at.shadowed, jnp.where(own, now, was), offset, 0)
-        cover = jnp.repeat(at.cover[:n_parents], b, total_repeat_length=n_children) + done.accepts
+        cover = _for_each_child(at.cover[:n_parents], b) + done.accepts
         counts = _with_level(at.counts, lists, done, level, hierarchy, plan)
         return AtLevel(done.lists.of_first(n_kept), (now & own)[:n_kept], cover[:n_kept], shadowed, counts)
 
@@ -118,6 +118,12 @@ def descend(at: AtLevel, first: int, last: int, volume: Volumes, hierarchy: Hier
     if last == len(levels):
         at = visit(at, n_inner, levels[-1], levels[-1] * b, LEAF_LANES, plan.leaf_groups)
     return at
+
+
+def _for_each_child(of_parent: Array, branching: int) -> Array:
+    """What each child has of its parent. Not `jnp.repeat`, whose scan of places XLA folds while it compiles, for up to
+    two minutes."""
+    return jnp.broadcast_to(of_parent[:, None], (of_parent.shape[0], branching)).reshape(-1)
 
 
 def _widened(at: AtLevel, n_nodes: int, capacity: int, absent: int) -> AtLevel:
