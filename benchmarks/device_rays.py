@@ -19,8 +19,13 @@ from vtfs.shadow_casters import Casters, ShadowLight
 LIT, BY_ITSELF, SHADOWED = 0, 1, 2
 """What a sample is: lit; met by the triangle that it lies on alone, which counts as lit; shadowed by another."""
 
-CHUNK = 256
-SAMPLES_AT_ONCE = 2**17
+CHUNK = 32
+"""Triangles that one kernel tests, one after the other: reduced over as an axis, they took thirty times as long."""
+
+SAMPLES_AT_ONCE = 2**20
+PADDED_TO = 2**18
+"""Samples, where there are more, to a multiple of so many: few programs."""
+
 LEAST_HEIGHT = 1e-12
 """A light lies in a triangle's plane where its height above it is less than this share of its farthest corner's
 distance: rounding, which has no inside."""
@@ -57,20 +62,20 @@ def answers(
         left = np.maximum(distance - bias_m, 0) / np.maximum(distance, 1e-300)
         start = start * left
         way = -start
-    corner = _sent(casters, about, light, casts)
+    triangle = _sent(casters, about, light, casts)
     found = np.zeros(len(points_m), np.uint8)
     with jax.enable_x64(True):
-        corner = jax.device_put(corner)
+        triangle = jax.device_put(triangle)
         for first in range(0, len(points_m), SAMPLES_AT_ONCE):
             some = slice(first, first + SAMPLES_AT_ONCE)
             n = len(start[some])
-            pad = [(0, SAMPLES_AT_ONCE - n if len(points_m) > SAMPLES_AT_ONCE else -n % 1_024)]
+            pad = [(0, -n % (PADDED_TO if n > PADDED_TO else 1_024))]
             sent_start, sent_way = (tuple(np.pad(v[some, c], pad) for c in range(3)) for v in (start, way))
             met = _met(
                 sent_start,
                 sent_way,
                 np.pad(own[some].astype(np.int32), pad, constant_values=-1),
-                corner,
+                triangle,
                 light.directional,
             )
             found[some] = np.asarray(met)[:n]
@@ -78,9 +83,11 @@ def answers(
 
 
 def _sent(casters: Casters, about_m: np.ndarray, light: ShadowLight, casts: np.ndarray | None) -> np.ndarray:
-    """Corners in chunks, `[chunks, 9, CHUNK]`; NaN, which no comparison holds for, where there is no inside."""
+    """A corner and two edges from it, in chunks, `[chunks, 9, CHUNK]`; NaN, which no comparison holds for, where there
+    is no inside."""
     corner = casters.vertices_m[casters.triangles] - about_m
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    edges = corner[:, 1:] - corner[:, :1]
+    normal = np.cross(edges[:, 0], edges[:, 1])
     if light.directional:
         height = normal @ light.homogeneous[:3]
         size = np.linalg.norm(normal, axis=1)
@@ -91,31 +98,33 @@ def _sent(casters: Casters, about_m: np.ndarray, light: ShadowLight, casts: np.n
     if casts is not None:
         has_inside &= casts
     rows = np.full((-(-len(corner) // CHUNK) * CHUNK, 9), np.nan)
-    rows[: len(corner)] = np.where(has_inside[:, None], corner.reshape(-1, 9), np.nan)
+    sent = np.concatenate([corner[:, :1], edges], axis=1).reshape(-1, 9)
+    rows[: len(corner)] = np.where(has_inside[:, None], sent, np.nan)
     return np.ascontiguousarray(rows.reshape(-1, CHUNK, 9).transpose(0, 2, 1))
 
 
 @functools.partial(jax.jit, static_argnames="directional")
 def _met(
-    start: Vector, way: Vector, own: Int[Array, " n"], corner: Float[Array, "chunks 9 chunk"], directional: bool
+    start: Vector, way: Vector, own: Int[Array, " n"], triangle: Float[Array, "chunks 9 chunk"], directional: bool
 ) -> UInt8[Array, " n"]:
     """Chunk by chunk, so that nothing of samples times triangles is ever kept."""
 
     def one_chunk(found, k):
-        a, b, c = (tuple(corner[k, 3 * v + i][:, None] for i in range(3)) for v in range(3))
-        index = (k * CHUNK + jnp.arange(CHUNK, dtype=jnp.int32))[:, None]
-        holds = _ray_meets(start, way, a, b, c, directional)
-        here = jnp.where(holds, jnp.where(index == own, BY_ITSELF, SHADOWED), LIT).astype(jnp.int32)
-        return jnp.maximum(found, here.max(axis=0)), None
+        rows = triangle[k]
+        for lane in range(CHUNK):
+            a, ab, ac = (tuple(rows[3 * v + i, lane] for i in range(3)) for v in range(3))
+            holds = _ray_meets(start, way, a, ab, ac, directional)
+            here = jnp.where(holds, jnp.where(k * CHUNK + lane == own, BY_ITSELF, SHADOWED), LIT)
+            found = jnp.maximum(found, here.astype(jnp.int32))
+        return found, None
 
-    chunks = jnp.arange(corner.shape[0], dtype=jnp.int32)
+    chunks = jnp.arange(triangle.shape[0], dtype=jnp.int32)
     found, _ = jax.lax.scan(one_chunk, jnp.zeros(own.shape, jnp.int32), chunks)
     return found.astype(jnp.uint8)
 
 
-def _ray_meets(start: Vector, way: Vector, a: Vector, b: Vector, c: Vector, directional: bool):
+def _ray_meets(start: Vector, way: Vector, a: Vector, ab: Vector, ac: Vector, directional: bool):
     """Does `start + t way` meet the triangle before the light, at 0 < t < 1 (directional: 0 < t)? Edges count."""
-    ab, ac = _minus(b, a), _minus(c, a)
     across = _cross(way, ac)
     det = _dot(ab, across)
     sign = jnp.where(det < 0, -1.0, 1.0)
