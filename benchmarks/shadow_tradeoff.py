@@ -4,8 +4,8 @@ python -m benchmarks.shadow_tradeoff SCENE[,SCENE...] --out DIR [--scenes FOLDER
     [--along 0] [--minutes 8] [--workers 1] [--only branching|tile_8|tile_32|trees]
 
 SCENE is `clumps`, a built-in name, or FOLDER/SCENE.glb with SCENE.cameras.json beside it. Branching at tiles of 8,
-tiles at 8 and at 32 children; and at 32 children, without feedback as in the paper, the full tree and two passes from
-either level. Each program runs from view samples to mask, capacities known. Programs are compiled side by side for
+tiles at 8 and at 32 children; and at 32 children, without feedback as in the paper, the full tree beside the compact
+one (both with 512 slices, as cubic cells are too many) and two passes from either level. Each program runs from view samples to mask, capacities known. Programs are compiled side by side for
 four fifths of the time; then, with nothing beside, all are timed in turns, twice. A line of
 DIR/shadow-tradeoff-cpu.jsonl (or gpu) is a configuration; what is there, on this device and at this size, is not run
 again. Tables and charts of it: `python -m benchmarks.shadow_tradeoff_charts`.
@@ -33,15 +33,20 @@ from vtfs.shadow_techniques import fitted_to_all, run_program, shadow_counts, sh
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
 
 BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (4, 16, 2, 32)
+FULL_TREE_SLICES = 512
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A technique and its plan; `group`: of `GROUPED`, the question that it answers."""
+    """A technique and its plan; `group`: of `GROUPED`, the question that it answers.
+
+    - `depth_slices`: 0: as many as make the cells cubic.
+    """
 
     technique: str
     plan: ShadowPlan
     group: str
+    depth_slices: int = 0
 
     @property
     def name(self) -> str:
@@ -49,7 +54,8 @@ class Variant:
         tree = f" {plan.tree}" if plan.tree == "full" else ""
         passes = f" two passes from level {plan.level}" if plan.passes == 2 else ""
         feedback = "" if plan.feedback else " no feedback"
-        return f"{self.technique} tile {plan.tile_px} b {plan.branching}{tree}{passes}{feedback}"
+        slices = f" {self.depth_slices} slices" if self.depth_slices else ""
+        return f"{self.technique} tile {plan.tile_px} b {plan.branching}{tree}{passes}{feedback}{slices}"
 
 
 def _both(tile_px: int, branching: int, group: str) -> list[Variant]:
@@ -60,12 +66,13 @@ def _both(tile_px: int, branching: int, group: str) -> list[Variant]:
 
 
 def _trees() -> list[Variant]:
-    """As the paper has it, one change at a time."""
+    """As the paper has it, one change at a time. A full tree of a million samples fits with `FULL_TREE_SLICES`."""
 
-    def of(**changes: Any) -> Variant:
-        return Variant("cluster_hierarchy", ShadowPlan(8, 32, feedback=False, **changes), "trees")
+    def of(depth_slices: int = 0, **changes: Any) -> Variant:
+        return Variant("cluster_hierarchy", ShadowPlan(8, 32, feedback=False, **changes), "trees", depth_slices)
 
-    return [of(), of(tree="full"), *(of(passes=2, level=level) for level in (1, 2))]
+    sliced = of(FULL_TREE_SLICES), of(FULL_TREE_SLICES, tree="full")
+    return [of(), *sliced, *(of(passes=2, level=level) for level in (1, 2))]
 
 
 GROUPED = {
@@ -105,9 +112,9 @@ class Ready:
 def prepare(key: str, subject: Subject, variant: Variant, one_at_once: threading.Lock) -> Ready:
     """Size and compile; `one_at_once` holds what runs on the device."""
     started, case, plan = time.monotonic(), subject.case, variant.plan
-    depth_slices = 0
+    depth_slices = variant.depth_slices
     try:
-        grid = shadow_grid(case.samples, plan.tile_px)
+        grid = shadow_grid(case.samples, plan.tile_px, depth_slices)
     except InputError:  # cubic cells as narrow as such tiles are more than keys can tell apart
         depth_slices = 2**KEY_BITS
         grid = shadow_grid(case.samples, plan.tile_px, depth_slices)
