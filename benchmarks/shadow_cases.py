@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import functools
 import math
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,7 +17,8 @@ from vtfs.camera import Camera, CameraPath, Pose, Viewport, load_cameras
 from vtfs.gallery import GALLERY, build_scene
 from vtfs.scene import Material, Scene, load_scene
 from vtfs.shadow_casters import Casters, ShadowLight
-from vtfs.shadow_mask import ShadowPlan, default_bias_m, facing_samples
+from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan, default_bias_m, facing_samples
+from vtfs.shadow_techniques import counting_program
 from vtfs.view_samples import ViewSamples, trace_view_samples
 
 LIGHT = ShadowLight((10.0, 30.0, -20.0))
@@ -70,6 +73,20 @@ def with_room(plan: ShadowPlan, n_triangles: int, times: int = 1) -> ShadowPlan:
         return plan
     groups = max(times * 2**19, 2 * n_triangles)
     return replace(plan, groups=groups, leaf_groups=times * 2**22, pairs=times * 2**21 if plan.passes == 2 else 0)
+
+
+def run_alone(
+    technique: str, frame: ShadowFrame, one_at_once: threading.Lock
+) -> Callable[[ShadowPlan, int], ShadowMask]:
+    """What `fitted_to_all` runs: programs are compiled side by side, and run one after the other."""
+
+    def run(plan: ShadowPlan, _: int) -> ShadowMask:
+        with jax.enable_x64(True):
+            program = counting_program(technique, plan).lower(frame).compile()
+            with one_at_once:
+                return jax.block_until_ready(program(frame))
+
+    return run
 
 
 def scene_arguments(description: str | None, minutes: float) -> argparse.ArgumentParser:

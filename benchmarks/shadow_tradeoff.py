@@ -5,10 +5,11 @@ python -m benchmarks.shadow_tradeoff SCENE[,SCENE...] --out DIR [--scenes FOLDER
 
 SCENE is `clumps`, a built-in name, or FOLDER/SCENE.glb with SCENE.cameras.json beside it. Branching at tiles of 8,
 tiles at 8 and at 32 children; and at 32 children, without feedback as in the paper, the full tree beside the compact
-one (both with 512 slices, as cubic cells are too many) and two passes from either level. Each program runs from view samples to mask, capacities known. Programs are compiled side by side for
-four fifths of the time; then, with nothing beside, all are timed in turns, twice. A line of
-DIR/shadow-tradeoff-cpu.jsonl (or gpu) is a configuration; what is there, on this device and at this size, is not run
-again. Tables and charts of it: `python -m benchmarks.shadow_tradeoff_charts`.
+one (both with 512 slices, as cubic cells are too many) and two passes from either level. Each program runs from view
+samples to mask, capacities known. Programs are compiled side by side for four fifths of the time; then, with nothing
+beside, all are timed in turns, twice. A line of DIR/shadow-tradeoff-cpu.jsonl (or gpu) is a configuration; what is
+there, on this device and at this size, is not run again. Tables and charts of it: `python -m
+benchmarks.shadow_tradeoff_charts`.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ import jax
 import numpy as np
 
 from benchmarks.run_lines import RunLines, side_by_side, why
-from benchmarks.shadow_cases import Case, named_case, scene_arguments, with_room
+from benchmarks.shadow_cases import Case, named_case, run_alone, scene_arguments, with_room
 from benchmarks.shadows import embree, times_ms
 from vtfs.device import device_name, keep_compiled_programs, versions
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.shadow_mask import CastersOnDevice, ShadowFrame, ShadowMask, ShadowPlan, casters_on_device, shadow_frame
-from vtfs.shadow_techniques import fitted_to_all, run_program, shadow_counts, shadow_grid, shadow_program
+from vtfs.shadow_techniques import fitted_to_all, shadow_counts, shadow_grid, shadow_program
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
 
 BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (4, 16, 2, 32)
@@ -121,10 +122,7 @@ def prepare(key: str, subject: Subject, variant: Variant, one_at_once: threading
     frame = shadow_frame(case.samples, subject.casters, case.light, grid, case.bias_m, case.receives)
     plan = with_room(plan, case.casters.n_triangles)
 
-    def run(plan: ShadowPlan, _: int) -> ShadowMask:
-        with one_at_once:
-            return jax.block_until_ready(run_program(variant.technique, plan, frame))
-
+    run = run_alone(variant.technique, frame, one_at_once)
     plan, (sized,) = fitted_to_all(variant.technique, plan, [frame], run=run)
     with jax.enable_x64(True):
         program = shadow_program(variant.technique, plan).lower(frame).compile()
