@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 from vtfs.input_error import InputError
@@ -40,7 +41,7 @@ class Sizes:
 
 
 def _covering(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
-    return tuple(map(max, a, b)) if a and b else a or b
+    return tuple(itertools.starmap(max, itertools.zip_longest(a, b, fillvalue=0)))
 
 
 NO_SIZES = Sizes(0, 0, 0)

@@ -55,6 +55,19 @@ class NodeLists(eqx.Module):
         """Without the nodes from the `n`-th on, whose lists are empty."""
         return NodeLists(self.triangle, self.start[: n + 1], self.count[:n], self.node)
 
+    def at_slots(self, slot: Int[Array, " kept"], number: Int[Array, " nodes"]) -> NodeLists:
+        """Of some of the nodes alone, in order, where all others have empty lists.
+
+        **Arguments:**
+
+        - `slot`: those nodes; past all of them: none, an empty list. `number`: the place in `slot` of each of them.
+        """
+        n = self.count.shape[0]
+        start = jnp.concatenate([self.start[jnp.minimum(slot, n)], self.start[-1:]])
+        count = jnp.where(slot < n, self.count[jnp.minimum(slot, n - 1)], 0)
+        node = None if self.node is None else jnp.maximum(number[self.node], 0)
+        return NodeLists(self.triangle, start, count, node)
+
 
 def group_starts(count: Int[Array, " nodes"], lanes: int) -> Int[Array, " nodes_and_1"]:
     groups = -(-count // lanes)

@@ -61,14 +61,16 @@ class ShadowPlan:
       tests.
     - `batch`: triangles walked together, 0: all. Never changes the mask.
     - `passes`: 1 or 2; `level`: where the first of two ends, counted from the root; 0: halfway down.
-    - `tree`: of cluster_hierarchy: over the occupied clusters, or over all cells, each at the place of its key.
+    - `tree`: of cluster_hierarchy: its nodes that hold occupied clusters, in a list; or all, at the places of their
+      keys.
     - `stencil`: of z-pass and z-fail: 8 bits that wrap or saturate, or no limit; `around_eye`: z-pass starts with the
       volumes
       around the eye, without which it fails where the camera stands in one.
     - `precision`: in which samples are tested against planes. float32 leaks at vertices: it is there to show that.
     - `blending`: what alpha casters do to light; `opaque`: they cast nothing.
-    - `clusters`, `groups`, `leaf_groups`, `pairs`, `cells`: rounded capacities: of clusters and their blocks, of the
-      lists of a level, of the lists of tiles or clusters, of what goes on to a second pass, of the full tree.
+    - `clusters`, `groups`, `leaf_groups`, `pairs`, `cells`, `nodes`: rounded capacities: of clusters and their blocks,
+      of the lists of a level, of the lists of tiles or clusters, of what goes on to a second pass, of the keys of
+      clusters, of the nodes of a level of a compact tree.
     - `level_groups`: capacities of each level's lists. Then levels are unrolled and nothing loops, which suits a GPU;
       without them one loop runs over levels of `groups`, in chunks, which suits a CPU.
     """
@@ -91,6 +93,7 @@ class ShadowPlan:
     leaf_groups: int = 0
     pairs: int = 0
     cells: int = 0
+    nodes: int = 0
     level_groups: tuple[int, ...] = ()
 
 
@@ -107,7 +110,7 @@ class ShadowCounts(eqx.Module):
     - `groups`: groups of each level's lists, the leaves' last: what the capacities must hold; `n_pairs`: pairs that go
       on to a second pass, likewise.
     - `list_length`: triangles tested against each tile or cluster.
-    - `n_items`: occupied tiles or clusters; `n_blocks`: what `clusters` must hold.
+    - `n_items`: occupied tiles or clusters; `n_blocks`, `n_nodes`: what `clusters` and `nodes` must hold.
     - `n_casters`: triangles with a volume.
     """
 
@@ -126,6 +129,7 @@ class ShadowCounts(eqx.Module):
     list_length: Int[Array, " items"]
     n_items: Int[Array, ""]
     n_blocks: Int[Array, ""]
+    n_nodes: Int[Array, ""]
     n_casters: Int[Array, ""]
 
 

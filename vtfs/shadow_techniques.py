@@ -25,7 +25,7 @@ from vtfs.shadow_mask import (
     shadow_frame,
 )
 from vtfs.shadow_volumes.cluster_hierarchy import cluster_hierarchy
-from vtfs.shadow_volumes.full_tree import n_cells
+from vtfs.shadow_volumes.full_tree import n_cells, require_room
 from vtfs.shadow_volumes.levels import LANES, LEAF_LANES
 from vtfs.shadow_volumes.ptsv import ptsv
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
@@ -78,15 +78,17 @@ def alpha_plan(config: Configuration) -> ShadowPlan:
 
 
 def shadow_sizes(plan: ShadowPlan) -> tuple[int, ...]:
-    """The capacities of a plan, as numbers of which the larger one holds more."""
-    return plan.clusters, plan.groups, plan.leaf_groups, plan.pairs, plan.cells, *plan.level_groups
+    """The capacities of a plan, as numbers of which the larger one holds more; levels from the leaves up, as one tree
+    may be deeper than another."""
+    of_levels = plan.level_groups[::-1]
+    return plan.clusters, plan.groups, plan.leaf_groups, plan.pairs, plan.cells, plan.nodes, *of_levels
 
 
 def with_shadow_sizes(plan: ShadowPlan, sizes: tuple[int, ...]) -> ShadowPlan:
     """The plan with such capacities; none where they are not known yet."""
     if not sizes:
         return plan
-    clusters, groups, leaf_groups, pairs, cells, *level_groups = sizes
+    clusters, groups, leaf_groups, pairs, cells, nodes, *of_levels = sizes
     return replace(
         plan,
         clusters=clusters,
@@ -94,7 +96,8 @@ def with_shadow_sizes(plan: ShadowPlan, sizes: tuple[int, ...]) -> ShadowPlan:
         leaf_groups=leaf_groups,
         pairs=pairs,
         cells=cells,
-        level_groups=tuple(level_groups),
+        nodes=nodes,
+        level_groups=tuple(of_levels[::-1]),
     )
 
 
@@ -189,10 +192,12 @@ def fitted_to_all(
     n_samples = int(np.prod(frames[0].receives.shape))
     n_triangles = frames[0].triangles.shape[0]
     viewport = frames[0].positions.viewport
-    if plan.tree == "full":
+    if technique == "cluster_hierarchy":
         columns, rows = -(-viewport.width_px // plan.tile_px), -(-viewport.height_px // plan.tile_px)
         n_slices = max(int(frame.grid.depth_slices) for frame in frames)
-        plan = replace(plan, cells=n_cells(columns, rows, n_slices, plan.branching))
+        plan = replace(plan, cells=n_cells(columns, rows, n_slices))
+    if plan.tree == "full":
+        require_room(plan.cells, plan.branching)
     plan = replace(
         plan,
         clusters=plan.clusters or _rounded_up("clusters", n_samples // min(8, plan.tile_px), _FIRST.clusters),
@@ -202,6 +207,8 @@ def fitted_to_all(
         pairs=plan.pairs or (_rounded_up("pairs", 4 * n_triangles, 2**10) if plan.passes == 2 else 0),
         level_groups=(),
     )
+    if technique == "cluster_hierarchy" and plan.tree == "compact":
+        plan = replace(plan, nodes=plan.nodes or _rounded_up("nodes", plan.clusters // min(2 * plan.branching, 32), 64))
     while True:
         masks = [run(plan, i) for i in range(len(frames))]
         needed = np.max([np.asarray(mask.counts.groups) for mask in masks], axis=0).astype(np.int64)
@@ -209,8 +216,11 @@ def fitted_to_all(
             break
         n_blocks = max(int(mask.counts.n_blocks) for mask in masks)
         n_pairs = max(int(mask.counts.n_pairs) for mask in masks)
+        n_nodes = max(int(mask.counts.n_nodes) for mask in masks)
         grown = replace(plan, clusters=_rounded_up("clusters", n_blocks, plan.clusters))
-        if n_blocks <= plan.clusters:  # else the lists are meaningless
+        if n_blocks <= plan.clusters:  # else the nodes are meaningless
+            grown = replace(grown, nodes=_rounded_up("nodes", n_nodes, plan.nodes))
+        if n_blocks <= plan.clusters and n_nodes <= plan.nodes:  # else the lists are
             grown = replace(
                 grown,
                 groups=_rounded_up("lists", _more(needed[:-1].max(), plan.groups), plan.groups),
@@ -222,21 +232,19 @@ def fitted_to_all(
             raise InputError(f"{technique}: the frame fits no capacity; use larger tiles or a batch.")
         plan = grown
     if jax.default_backend() != "cpu" if unrolled is None else unrolled:
-        plan = _unrolled(plan, needed, max(int(mask.counts.n_blocks) for mask in masks))
+        n_blocks, n_nodes = (
+            max(int(n) for n in of_masks)
+            for of_masks in ([m.counts.n_blocks for m in masks], [m.counts.n_nodes for m in masks])
+        )
+        plan = _unrolled(plan, needed, n_blocks, n_nodes)
     return plan, masks
 
 
-def _unrolled(plan: ShadowPlan, needed: np.ndarray, n_blocks: int) -> ShadowPlan:
-    """The plan with what each level needs, and no more clusters than there are.
-
-    With fewer clusters the tree may lose levels above what is now the root, each of one node: those below keep their
-    lists. A level to restart from is counted from the root, so that two passes keep them all.
-    """
+def _unrolled(plan: ShadowPlan, needed: np.ndarray, n_blocks: int, n_nodes: int) -> ShadowPlan:
+    """The plan with what each level needs, and no more clusters and nodes than there are."""
     levels = tuple(_rounded_up_finely(int(n)) for n in needed[1:-1])
-    clusters = _rounded_up_finely(n_blocks) if n_blocks and not plan.cells else plan.clusters
-    n_inner = len(inner_level_nodes(clusters, plan.branching))
-    if n_blocks and not plan.cells and (n_inner == len(levels) or (plan.passes == 1 and n_inner)):
-        plan, levels = replace(plan, clusters=clusters), levels[len(levels) - n_inner :]
+    if plan.tree == "compact" and n_blocks:
+        plan = replace(plan, clusters=_rounded_up_finely(n_blocks), nodes=_rounded_up_finely(n_nodes))
     if not levels:
         return plan
     return replace(plan, level_groups=levels, leaf_groups=_rounded_up_finely(int(needed[-1])), groups=0)
@@ -404,7 +412,11 @@ def _memory(plan: ShadowPlan, frame: ShadowFrame) -> int:
     groups = sum(plan.level_groups) if plan.level_groups else 2 * plan.groups
     lists = 4 * (LANES * groups + LEAF_LANES * plan.leaf_groups) + 12 * plan.branching * groups
     planes = frame.triangles.shape[0] * (8 * 13 + 4 * (13 + (9 if plan.extra != "off" else 0)))
-    n_items = plan.cells or plan.clusters or int(np.prod(frame.receives.shape)) // plan.tile_px**2
-    tree = 24 * n_items * plan.branching // (plan.branching - 1)
+    if plan.nodes:
+        n_levels = sum(min(n, plan.nodes) for n in inner_level_nodes(plan.cells, plan.branching)) + plan.nodes
+        tree = 24 * plan.clusters + 28 * n_levels * plan.branching
+    else:
+        n_items = plan.cells or int(np.prod(frame.receives.shape)) // plan.tile_px**2
+        tree = 24 * n_items * plan.branching // (plan.branching - 1)
     samples = 16 * int(np.prod(frame.receives.shape))
     return lists + planes + tree + samples

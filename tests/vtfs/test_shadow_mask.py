@@ -30,7 +30,7 @@ from vtfs.shadow_mask import (
 )
 from vtfs.shadow_references import ShadowRays, brute_force, classify, facing_light, kept_casters, view_points_m
 from vtfs.shadow_techniques import cast_shadows, fitted, on_host, run_program, shadow_grid, shadow_program
-from vtfs.shadow_volumes.full_tree import n_cells
+from vtfs.shadow_volumes.full_tree import n_cells, require_room
 from vtfs.shadow_volumes.volumes import volumes
 from vtfs.shadow_volumes.walk import restart_level
 from vtfs.view_samples import ViewSamples, trace_view_samples
@@ -233,6 +233,7 @@ def test_bad_input_is_refused_by_name(make, message):
 
 TWICE = replace(CLUSTERS, passes=2, batch=64, pairs=2**12)
 VARIANTS = {
+    "full tree": ("cluster_hierarchy", replace(CLUSTERS, tree="full", cells=2**12)),
     "batches, full tree": ("cluster_hierarchy", replace(CLUSTERS, batch=64, tree="full", cells=2**12)),
     "two passes": ("cluster_hierarchy", replace(TWICE, level=2, feedback=False)),
     "ptsv, two passes": ("ptsv", replace(TWICE, level=1, branching=4, extra="silhouette")),
@@ -244,7 +245,7 @@ def test_variants_change_tests_and_not_the_mask():
     rng = np.random.default_rng(6)
     samples, casters = surface_samples(camera, 6), soup(camera, rng, largest=1.0)
     light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
-    whole = cast("cluster_hierarchy", CLUSTERS, samples, casters, light, bias_m)
+    whole = cast("cluster_hierarchy", replace(CLUSTERS, cells=2**12), samples, casters, light, bias_m)
     assert_equal_outside_the_bands(whole.shadowed, samples, casters, light, bias_m, 0.01)
     found = {name: cast(*variant, samples, casters, light, bias_m) for name, variant in VARIANTS.items()}
     for name, other in {"whole": whole, **found}.items():
@@ -266,7 +267,9 @@ def test_variants_change_tests_and_not_the_mask():
         assert counts["listed_pairs"] == counts[f"refined_{max(levels)}"]
     assert 0 < whole.shadowed.sum() < samples.n_valid
     # What feedback spares is counted: nodes, and samples that earlier batches shadow.
-    spared, plain, twice = (other.counts for other in found.values())
+    full, spared, plain, twice = (other.counts for other in found.values())
+    # A compact tree has the nodes of the full one that hold a cluster: all the same tests, on all levels.
+    assert {k: v for k, v in full.items() if k != "memory"} == {k: whole.counts[k] for k in full if k != "memory"}
     assert plain["dropped_nodes"] == plain["dropped_samples"] == 0 < spared["dropped_samples"]
     assert min(spared["dropped_nodes"], whole.counts["dropped_nodes"], twice["dropped_nodes"]) > 0
     assert whole.counts["node_tests"] < plain["node_tests"]
@@ -291,7 +294,7 @@ def test_the_only_child_of_a_full_trees_root_need_not_be_its_first():
     samples, casters = surface_samples(camera, 6), soup(camera, rng, largest=1.0)
     light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
     columns, rows = -(-SMALL.width_px // 8), -(-SMALL.height_px // 8)
-    cells = n_cells(columns, rows, int(shadow_grid(samples, 8).depth_slices), 8)
+    cells = n_cells(columns, rows, int(shadow_grid(samples, 8).depth_slices))
     found = cast("cluster_hierarchy", replace(CLUSTERS, tree="full", cells=cells), samples, casters, light, bias_m)
     assert found.counts["node_tests_0"] == 0  # the root has one child
     reference = assert_equal_outside_the_bands(found.shadowed, samples, casters, light, bias_m, 0.01)
@@ -299,9 +302,10 @@ def test_the_only_child_of_a_full_trees_root_need_not_be_its_first():
 
 
 def test_the_full_tree_is_refused_where_it_is_too_large():
-    assert n_cells(128, 100, 200, 8) == 2**22
-    with pytest.raises(InputError, match=r"tree=full: 240 x 135 x 512 cells .* MiB, more than 256; use tree=compact"):
-        n_cells(240, 135, 512, 32)
+    assert n_cells(128, 100, 200) == 2**22
+    require_room(2**22, 8)
+    with pytest.raises(InputError, match=r"tree=full: .* 33,554,432 places.* MiB, more than 256; use tree=compact"):
+        require_room(n_cells(240, 135, 512), 32)
 
 
 def test_a_restart_level_that_is_not_there_is_refused_by_name():
@@ -325,8 +329,8 @@ def test_what_does_not_fit_is_refused_and_run_again_not_cut():
     frame = shadow_frame(samples, casters_on_device(casters), light, shadow_grid(samples, 8), bias_m)
     plan = fitted("cluster_hierarchy", small, frame, unrolled=True)
     assert plan.leaf_groups > 4
-    # No more clusters than there are, and none of the levels that only the rounding of their number made: there were 4.
-    assert plan.clusters < CLUSTERS.clusters and 0 < len(plan.level_groups) < 4
+    # No more clusters and nodes than there are, and the levels of as many keys as the grid has.
+    assert plan.clusters == plan.nodes == 64 < CLUSTERS.clusters and plan.cells == 4 ** len(plan.level_groups) * 4
     # The program that is timed, as a GPU runs it: another branching, no loops, and the same mask.
     with jax.enable_x64(True):
         shadowed, overflowed = shadow_program("cluster_hierarchy", plan)(frame)

@@ -1,4 +1,4 @@
-"""The full tree: every cell of the grid at the place of its key, so that no list says where a child is."""
+"""Keys of the clusters, and the full tree: every cell at the place of its key, so that no list says where a child is."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ MOST_BYTES = 256 * 2**20
 """Of the boxes of all nodes and the masks of their children (Sintorn et al. 2014, Sec. 5)."""
 
 
-def n_cells(columns: int, rows: int, slices: int, branching: int) -> int:
-    """Places of a full tree: a power of two along each axis.
+def n_cells(columns: int, rows: int, slices: int) -> int:
+    """Keys of a grid: a power of two along each axis."""
+    return 1 << sum((n - 1).bit_length() for n in (columns, rows, slices))
 
-    **Raises:** `InputError` where it needs more than `MOST_BYTES`.
-    """
-    bits = tuple((n - 1).bit_length() for n in (columns, rows, slices))
-    cells = 1 << sum(bits)
+
+def require_room(cells: int, branching: int) -> None:
+    """**Raises:** `InputError` where a full tree over so many cells needs more than `MOST_BYTES`."""
     n_bytes = n_tree_bytes(cells, branching)
     if n_bytes > MOST_BYTES:
         raise InputError(
-            f"tree=full: {columns} x {rows} x {slices} cells have {cells:,} places and take {n_bytes >> 20:,} MiB, "
-            f"more than {MOST_BYTES >> 20}; use tree=compact, larger tiles or fewer slices."
+            f"tree=full: a grid of this size has {cells:,} places, which take {n_bytes >> 20:,} MiB, more than "
+            f"{MOST_BYTES >> 20}; use tree=compact, larger tiles or fewer slices."
         )
-    return cells
 
 
 def n_tree_bytes(cells: int, branching: int) -> int:
@@ -38,17 +37,21 @@ def n_tree_bytes(cells: int, branching: int) -> int:
     return 24 * n_nodes + n_nodes // 8
 
 
-def at_their_keys(
-    clusters: SampleClusters, samples: SampleTiles, cells: int, branching: int
-) -> tuple[SampleClusters, Bool[Array, ""]]:
-    """The clusters, each at its key; and whether a slice lies beyond them."""
+def keys_of(
+    clusters: SampleClusters, samples: SampleTiles, cells: int
+) -> tuple[Int[Array, " capacity"], Bool[Array, ""]]:
+    """The key of each cluster, ascending, `cells` where there is none; and whether a slice lies beyond them."""
     bits = [(n - 1).bit_length() for n in (samples.columns, samples.rows)]
     bits.append(max(cells.bit_length() - 1 - sum(bits), 0))
     column, row = clusters.tile % samples.columns, clusters.tile // samples.columns
     exists = jnp.arange(clusters.tile.shape[0], dtype=jnp.int32) < clusters.n_clusters
     beyond = jnp.any(exists & (clusters.slice_k >= 1 << bits[2]))
-    key = _interleaved((column, row, clusters.slice_k), tuple(bits))
-    place = jnp.where(exists, key, cells)
+    parts = tuple(part.astype(jnp.int64) for part in (column, row, clusters.slice_k))
+    return jnp.where(exists, _interleaved(parts, tuple(bits)), cells), beyond
+
+
+def at_their_keys(clusters: SampleClusters, place: Int[Array, " capacity"], cells: int) -> SampleClusters:
+    """The clusters, each at its key."""
 
     def put(values: Array, absent) -> Array:
         empty = jnp.full((cells, *values.shape[1:]), absent, values.dtype)
@@ -57,11 +60,11 @@ def at_their_keys(
     box = clusters.box
     lows = (put(c, jnp.inf) for c in (box.low_x_m, box.low_y_m, box.low_z_m))
     highs = (put(c, -jnp.inf) for c in (box.high_x_m, box.high_y_m, box.high_z_m))
-    of_sample = key[jnp.clip(clusters.of_sample, 0, key.shape[0] - 1)]
+    of_sample = place.astype(jnp.int32)[jnp.clip(clusters.of_sample, 0, place.shape[0] - 1)]
     return SampleClusters(
         put(clusters.tile, 0), put(clusters.slice_k, 0), Aabb(*lows, *highs), clusters.n_clusters, of_sample,
         put(clusters.members, 0), clusters.n_blocks,
-    ), beyond  # fmt: skip
+    )  # fmt: skip
 
 
 def _interleaved(parts: tuple[Int[Array, " n"], ...], n_bits: tuple[int, ...]) -> Int[Array, " n"]:

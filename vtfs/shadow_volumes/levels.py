@@ -85,9 +85,13 @@ def descend(at: AtLevel, first: int, last: int, volume: Volumes, hierarchy: Hier
 
     def visit(at: AtLevel, level, n_parents: int, n_kept: int, lanes: int, capacity: int) -> AtLevel:
         lists = at.lists.of_first(n_parents)
-        n_children = n_parents * b
-        offset = jnp.asarray(table.first_child)[level]
-        was = jax.lax.dynamic_slice_in_dim(at.shadowed, offset, n_children)
+        n_slots = n_parents * b
+        first = jnp.asarray(table.first_child)[level]
+        of_slot, slot = table.children_of(level, n_parents), table.slots_of(level, n_kept)
+        if of_slot is None:
+            was = jax.lax.dynamic_slice_in_dim(at.shadowed, first, n_slots)
+        else:
+            was = at.shadowed[first + jnp.maximum(of_slot, 0)] & (of_slot >= 0)
         parent = _for_each_child(at.in_shadow[:n_parents], b)
 
         def drop(accepted):
@@ -98,11 +102,19 @@ def descend(at: AtLevel, first: int, last: int, volume: Volumes, hierarchy: Hier
         row = jnp.asarray(table.first_row)[level]
         done = _split_level(lists, drop, row, only, lanes, capacity, volume, hierarchy, plan, chunk)
         now = parent | (done.accepts > 0) | was
-        own = jnp.arange(n_children, dtype=jnp.int32) < jnp.asarray((*levels[1:], levels[-1] * b), jnp.int32)[level]
-        shadowed = jax.lax.dynamic_update_slice_in_dim(at.shadowed, jnp.where(own, now, was), offset, 0)
         cover = _for_each_child(at.cover[:n_parents], b) + done.accepts
         counts = _with_level(at.counts, lists, done, level, hierarchy, plan)
-        return AtLevel(done.lists.of_first(n_kept), (now & own)[:n_kept], cover[:n_kept], shadowed, counts)
+        if slot is None:
+            lists, own = done.lists.of_first(n_kept), jnp.asarray((*levels[1:], levels[-1] * b), jnp.int32)[level]
+        else:
+            lists, own = done.lists.at_slots(slot, of_slot), table.n_below[level]
+            there = slot < n_slots
+            was = jax.lax.dynamic_slice_in_dim(at.shadowed, first, n_kept)
+            slot = jnp.minimum(slot, n_slots - 1)
+            now, cover = now[slot] & there, jnp.where(there, cover[slot], 0)
+        is_own = jnp.arange(now.shape[0], dtype=jnp.int32) < own
+        shadowed = jax.lax.dynamic_update_slice_in_dim(at.shadowed, jnp.where(is_own, now, was), first, 0)
+        return AtLevel(lists, (now & is_own)[:n_kept], cover[:n_kept], shadowed, counts)
 
     if at_once:
         for level in range(first, min(last, n_inner)):
@@ -116,7 +128,7 @@ def descend(at: AtLevel, first: int, last: int, volume: Volumes, hierarchy: Hier
 
         at = jax.lax.fori_loop(first, min(last, n_inner), inner, at)
     if last == len(levels):
-        at = visit(at, n_inner, levels[-1], levels[-1] * b, LEAF_LANES, plan.leaf_groups)
+        at = visit(at, n_inner, levels[-1], table.n_places - sum(levels[1:]), LEAF_LANES, plan.leaf_groups)
     return at
 
 

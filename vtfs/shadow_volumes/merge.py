@@ -38,6 +38,7 @@ def mask_of(
         list_length=walk.list_length,
         n_items=hierarchy.n_items,
         n_blocks=hierarchy.n_blocks,
+        n_nodes=hierarchy.n_nodes,
         n_casters=jnp.sum(casts, dtype=jnp.int32),
     )
     view = samples.viewport, samples.tile_px

@@ -45,5 +45,6 @@ def over_tiles(samples, table, is_frustum: bool) -> Hierarchy:
     item_of_sample = jnp.broadcast_to(jnp.asarray(place_of)[:, None], samples.receives.shape)
     n_items = jnp.sum(n_in_tile > 0, dtype=jnp.int32)
     return Hierarchy(
-        samples, table, tiles, item_of_sample, members, n_in_tile, n_items, jnp.int32(0), jnp.bool_(False), is_frustum
-    )
+        samples, table, tiles, item_of_sample, members, n_in_tile, n_items, jnp.int32(0), jnp.int32(0),
+        jnp.bool_(False), is_frustum,
+    )  # fmt: skip
