@@ -19,7 +19,7 @@ from vtfs.gallery import build_scene
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.scene import load_scene
-from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, opaque_casters
+from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, opaque_casters, welded
 from vtfs.shadow_mask import (
     ShadowPlan,
     casters_on_device,
@@ -167,6 +167,17 @@ def test_each_edge_is_listed_once_with_its_two_triangles():
     closed = edge_list(np.array(ball.faces, np.int32))
     assert len(closed) == len(ball.edges_unique) and (closed[:, 2:] >= 0).all()
     assert ((closed[:, 2] + closed[:, 3]) % 2 == 1).all()  # neighbours run along their edge in opposite directions
+    # Where each triangle has vertices of its own, as at the seams of textures, the edges are the same.
+    order = np.random.default_rng(0).permutation(ball.faces.size)
+    split = np.empty((ball.faces.size, 3))
+    split[order] = ball.vertices[ball.faces.ravel()]
+    split[split == 0] = -0.0  # a place all the same
+    split[: len(split) // 2] += 0.0
+    alone = order.reshape(-1, 3)
+    assert (edge_list(alone)[:, 3] < 0).all()
+    joined = edge_list(welded(split, alone))
+    assert len(joined) == len(closed) and (joined[:, 2:] >= 0).all()
+    assert (split[welded(split, alone)] == ball.vertices[ball.faces]).all()
 
 
 def bad_triangles(kind: str, light_m: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
