@@ -109,6 +109,7 @@ class ShadowCounts(eqx.Module):
     - `list_length`: triangles tested against each tile or cluster.
     - `n_items`: occupied tiles or clusters; `n_blocks`: what `clusters` must hold.
     - `n_casters`: triangles with a volume.
+    - `bytes_held`: by the planes of all volumes, by the tree, and by the samples with the bits of their tiles.
     """
 
     node_tests: Int[Array, " levels"]
@@ -127,6 +128,7 @@ class ShadowCounts(eqx.Module):
     n_items: Int[Array, ""]
     n_blocks: Int[Array, ""]
     n_casters: Int[Array, ""]
+    bytes_held: Int[Array, " 3"]
 
 
 class ShadowMask(eqx.Module):
