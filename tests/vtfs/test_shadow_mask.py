@@ -108,14 +108,14 @@ def test_a_triangle_soup_shadows_what_brute_force_says(technique, plan, seed, ki
     assert (cast(technique, plan, samples, shuffled, light, bias_m, front_faces).shadowed == found.shadowed).all()
 
 
-def test_a_directional_light_shadows_what_brute_force_says():
-    plan = replace(CLUSTERS, extra="vertex")
+@pytest.mark.parametrize(("technique", "plan"), [("cluster_hierarchy", CLUSTERS), ("ptsv", TILES)])
+def test_a_directional_light_shadows_what_brute_force_says(technique, plan):
     camera = a_camera(SMALL, eye_m=(1e6, -3e5, 1e6))
     for seed in range(4):
         rng = np.random.default_rng(seed)
         samples, casters, light = surface_samples(camera, seed), soup(camera, rng), light_of(camera, "directional", rng)
         bias_m = default_bias_m(casters)
-        mask = cast("cluster_hierarchy", plan, samples, casters, light, bias_m).shadowed
+        mask = cast(technique, plan, samples, casters, light, bias_m).shadowed
         assert_equal_outside_the_bands(mask, samples, casters, light, bias_m, 0.01)
 
 
@@ -133,14 +133,15 @@ def balls(camera: Camera, rng: np.random.Generator) -> Casters:
     return Casters(np.concatenate(parts) + camera.eye_m, np.concatenate(triangles))
 
 
+@pytest.mark.parametrize("kinds", [("inside", "far", "near"), ("directional",)], ids=["point", "directional"])
 @pytest.mark.parametrize("technique", ["z_pass", "z_fail"])
-def test_stencils_shadow_what_brute_force_says(technique):
+def test_stencils_shadow_what_brute_force_says(technique, kinds):
     n_shadowed = 0
     for seed in range(8):
         rng = np.random.default_rng(seed)
         camera = a_camera(SMALL, eye_m=((1.0, 2.0, 3.0), (1e6, -3e5, 1e6))[seed % 2])
         samples, casters = surface_samples(camera, seed), balls(camera, rng)
-        light = light_of(camera, ("inside", "far", "near")[seed % 3], rng)
+        light = light_of(camera, kinds[seed % len(kinds)], rng)
         bias_m = default_bias_m(casters)
         receives = samples.valid.copy()
         if technique == "z_pass":  # it has no caps: only what the eye sees is right
