@@ -246,7 +246,7 @@ def test_bad_input_is_refused_by_name(make, message):
 TWICE = replace(CLUSTERS, passes=2, batch=64, pairs=2**12)
 VARIANTS = {
     "batches, full tree": ("cluster_hierarchy", replace(CLUSTERS, batch=64, tree="full", cells=2**12)),
-    "two passes": ("cluster_hierarchy", replace(TWICE, level=2, feedback=False)),
+    "two passes": ("cluster_hierarchy", replace(TWICE, level=3, feedback=False)),
     "ptsv, two passes": ("ptsv", replace(TWICE, level=1, branching=4, extra="silhouette")),
 }
 
