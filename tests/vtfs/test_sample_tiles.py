@@ -43,7 +43,7 @@ def test_clusters_are_the_tiles_and_slices_that_samples_lie_in(tile_px, n_slices
         expected.setdefault(cell, []).append((int(y), int(x)))
     assert n_slices < 100 or max(k for _, k in expected) > 512 + min(k for _, k in expected)
     with jax.enable_x64(True):
-        tiles = sample_tiles(positions_of(samples), to_runs(receives), tile_px)
+        tiles = sample_tiles(positions_of(samples), jnp.asarray(to_runs(receives)), tile_px)
         found = sample_clusters(tiles, grid, explicit=True, capacity=1024)
         back = from_runs(np.asarray(in_runs(tiles.receives, SMALL, tile_px)), SMALL)
     assert (back == receives).all()
@@ -72,7 +72,7 @@ def test_a_full_tree_holds_each_cluster_at_a_key_of_its_own():
     grid = shadow_grid(samples, 8, 700)
     cells = n_cells(-(-SMALL.width_px // 8), -(-SMALL.height_px // 8), 700, 8)
     with jax.enable_x64(True):
-        tiles = sample_tiles(positions_of(samples), to_runs(samples.valid), 8)
+        tiles = sample_tiles(positions_of(samples), jnp.asarray(to_runs(samples.valid)), 8)
         compact = sample_clusters(tiles, grid, explicit=True, capacity=1024)
         full, beyond = at_their_keys(compact, tiles, cells, 8)
         _, too_deep = at_their_keys(compact, tiles, cells // 4, 8)

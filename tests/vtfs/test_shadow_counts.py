@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -37,12 +38,12 @@ def counted_one_by_one(volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) 
     found, table, b = Counted(), hierarchy.table, plan.branching
     lists = {0: np.flatnonzero(volume.safe)}
     in_shadow: set[int] = set()
-    planes = jax.tree.map(lambda c: np.asarray(c, np.float64), volume.nodes.at(np.arange(N_TRIANGLES)))
+    planes = jax.tree.map(lambda c: np.asarray(c, np.float64), volume.nodes.at(jnp.arange(N_TRIANGLES)))
     for level, first in enumerate(table.first_row):
         only = int(table.n_below[level]) == 1
         children: dict[int, np.ndarray] = {}
         covered: set[int] = set()
-        total = dict.fromkeys(("tests", "accepted", "refined", "dropped", "extra"), 0)
+        total = dict.fromkeys((column.name for column in fields(Counted)[:5]), 0)
         for node, listed in lists.items():
             boxes = np.asarray(table.row[first + node], np.float64)
             for child in np.flatnonzero(~np.isnan(boxes[0])):
@@ -50,9 +51,10 @@ def counted_one_by_one(volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) 
                 if only:
                     children[place] = listed
                     continue
-                ends = [fate(planes, t, boxes[:, child], hierarchy.is_frustum, float(volume.bias_m)) for t in listed]
+                box = boxes[:, child]
+                ends = [fate(planes, t, box, hierarchy.is_frustum, float(volume.bias_m)) for t in listed.tolist()]
                 goes_on = np.array([end == "refined" for end in ends], bool)
-                total["tests"] += len(listed)
+                total["node_tests"] += len(listed)
                 total["accepted"] += ends.count("accepted")
                 total["extra"] += ends.count("refined") + ends.count("rejected by extra planes")
                 np.add.at(found.of_triangle, listed, 1)
@@ -64,8 +66,8 @@ def counted_one_by_one(volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) 
                     total["refined"] += int(goes_on.sum())
                     children[place] = listed[goes_on]
         lists, in_shadow = children, covered
-        for name, counts in (("tests", found.node_tests), *((n, getattr(found, n)) for n in list(total)[1:])):
-            counts.append(total[name])
+        for name, n in total.items():
+            getattr(found, name).append(n)
     for item, listed in lists.items():
         n_samples = int(hierarchy.n_in_tile[item])
         found.sample_tests += len(listed) * n_samples
