@@ -14,7 +14,7 @@ from vtfs.alpha_casters import Casting
 from vtfs.cluster_grid import ClusterGrid
 from vtfs.gbuffer import Fragments, Positions, to_runs
 from vtfs.layers import Layers
-from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight
+from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight, welded
 from vtfs.shadow_volumes.planes import Extra, Precision
 
 if TYPE_CHECKING:
@@ -109,6 +109,7 @@ class ShadowCounts(eqx.Module):
     - `list_length`: triangles tested against each tile or cluster.
     - `n_items`: occupied tiles or clusters; `n_blocks`: what `clusters` must hold.
     - `n_casters`: triangles with a volume.
+    - `bytes_held`: by the planes of all volumes, by the tree, and by the samples with the bits of their tiles.
     """
 
     node_tests: Int[Array, " levels"]
@@ -127,6 +128,7 @@ class ShadowCounts(eqx.Module):
     n_items: Int[Array, ""]
     n_blocks: Int[Array, ""]
     n_casters: Int[Array, ""]
+    bytes_held: Int[Array, " 3"]
 
 
 class ShadowMask(eqx.Module):
@@ -185,8 +187,8 @@ def edge_list(triangles: np.ndarray) -> np.ndarray:
 
 
 def casters_on_device(casters: Casters) -> CastersOnDevice:
-    """Upload casters; none at all become one triangle without area, as XLA cannot gather from nothing."""
-    vertices, triangles = casters.vertices_m, casters.triangles
+    """Upload casters, welded; none at all become one triangle without area, as XLA cannot gather from nothing."""
+    vertices, triangles = casters.vertices_m, welded(casters.vertices_m, casters.triangles)
     if not len(triangles):
         vertices, triangles = np.zeros((1, 3)), np.zeros((1, 3), np.int32)
     with jax.enable_x64(True):

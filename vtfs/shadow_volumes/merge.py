@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
@@ -14,13 +18,22 @@ from vtfs.shadow_volumes.walk import Walk, bits_of_samples
 
 def shadow_merge(volume: Volumes, hierarchy: Hierarchy, walk: Walk) -> ShadowMask:
     """The mask of all samples, in runs, with all counts."""
-    return mask_of(bits_of_samples(walk.shadowed, hierarchy), walk, volume.safe, hierarchy)
+    return mask_of(bits_of_samples(walk.shadowed, hierarchy), walk, volume.safe, volume, hierarchy)
 
 
 def mask_of(
-    shadowed: Bool[Array, "tiles lanes"], walk: Walk, casts: Bool[Array, " triangles"], hierarchy: Hierarchy
+    shadowed: Bool[Array, "tiles lanes"],
+    walk: Walk,
+    casts: Bool[Array, " triangles"],
+    planes: Any,
+    hierarchy: Hierarchy,
 ) -> ShadowMask:
-    """Samples of tiles back in runs."""
+    """Samples of tiles back in runs.
+
+    **Arguments:**
+
+    - `planes`: all arrays that say what casts, or their shapes: they are counted as bytes.
+    """
     samples, nodes = hierarchy.samples, walk.counts
     counts = ShadowCounts(
         node_tests=nodes.node_tests,
@@ -39,7 +52,18 @@ def mask_of(
         n_items=hierarchy.n_items,
         n_blocks=hierarchy.n_blocks,
         n_casters=jnp.sum(casts, dtype=jnp.int32),
+        bytes_held=jnp.array([_n_bytes(held) for held in (planes, *_tree_and_samples(hierarchy))], jnp.int64),
     )
     view = samples.viewport, samples.tile_px
     overflowed = walk.overflowed | hierarchy.overflowed
     return ShadowMask(in_runs(shadowed, *view), overflowed, in_runs(walk.tests, *view), counts)
+
+
+def _tree_and_samples(hierarchy: Hierarchy) -> tuple[Any, Any]:
+    """The nodes with the items below them, and the samples with the bits of the items' tiles."""
+    nodes = hierarchy.table, hierarchy.tile_of_item, hierarchy.n_in_tile, hierarchy.members
+    return nodes, (hierarchy.samples, hierarchy.item_of_sample, hierarchy.members)
+
+
+def _n_bytes(arrays: Any) -> int:
+    return sum(math.prod(array.shape) * array.dtype.itemsize for array in jax.tree.leaves(arrays))

@@ -161,7 +161,10 @@ def shadow_merge(
     shadowed = is_set(counts, plan.stencil, plan.around_eye and not by_failing)
     receives = hierarchy.samples.receives
     updates = jnp.sum(jnp.where(receives, counts.adding + counts.taking, 0), dtype=jnp.int64)
-    mask = mask_of(receives & shadowed, walk.walk, polygons.casts, hierarchy)
+    drawn = polygons.polygons
+    # Of one direction after the other, and gone by now: their shapes are known.
+    seen = jax.eval_shape(lambda drawn: _seen_volumes(drawn, drawn.crossing > 0, by_failing, plan.precision), drawn)
+    mask = mask_of(receives & shadowed, walk.walk, polygons.casts, (drawn, seen), hierarchy)
     return eqx.tree_at(lambda mask: mask.counts.stencil_updates, mask, updates)
 
 
