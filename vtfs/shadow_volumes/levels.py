@@ -176,22 +176,27 @@ def _split_level(
 def _with_level(
     counts: LevelCounts, lists: NodeLists, done: Split, level, hierarchy: Hierarchy, plan: ShadowPlan
 ) -> LevelCounts:
-    """The counts with those of one level."""
+    """The counts with those of one level. What the capacities must hold is always counted."""
     table = hierarchy.table
-    n_rows = lists.count.shape[0]
-    only = table.n_below[level] == 1
-    children = jax.lax.dynamic_slice_in_dim(table.n_children, jnp.asarray(table.first_row)[level], n_rows)
-    tests = jnp.where(only, 0, jnp.sum(lists.count.astype(jnp.int64) * children, dtype=jnp.int64))
-    extra = jnp.where(plan.extra != "off", done.extra, 0)
-    n_groups = lists.triangle.shape[0]
-    is_used = jnp.arange(n_groups, dtype=jnp.int32) < lists.n_groups
-    each = jnp.where(is_used & ~only, children[lists.nodes()], 0)
-    return LevelCounts(
-        counts.node_tests.at[level].add(tests),
-        counts.accepted.at[level].add(done.n_accepted),
-        counts.refined.at[level].add(jnp.where(only, 0, done.n_refined)),
-        counts.extra.at[level].add(extra),
-        counts.dropped.at[level].add(done.n_dropped),
-        counts.groups.at[level].max(lists.n_groups).at[level + 1].max(done.lists.n_groups),
-        counts.of_triangle.at[lists.triangle].add(each[:, None]),
-    )
+    groups = counts.groups.at[level].max(lists.n_groups).at[level + 1].max(done.lists.n_groups)
+    counts = eqx.tree_at(lambda counts: counts.groups, counts, groups)
+
+    def with_tests() -> LevelCounts:
+        n_rows = lists.count.shape[0]
+        only = table.n_below[level] == 1
+        children = jax.lax.dynamic_slice_in_dim(table.n_children, jnp.asarray(table.first_row)[level], n_rows)
+        tests = jnp.where(only, 0, jnp.sum(lists.count.astype(jnp.int64) * children, dtype=jnp.int64))
+        extra = jnp.where(plan.extra != "off", done.extra, 0)
+        is_used = jnp.arange(lists.triangle.shape[0], dtype=jnp.int32) < lists.n_groups
+        each = jnp.where(is_used & ~only, children[lists.nodes()], 0)
+        return LevelCounts(
+            counts.node_tests.at[level].add(tests),
+            counts.accepted.at[level].add(done.n_accepted),
+            counts.refined.at[level].add(jnp.where(only, 0, done.n_refined)),
+            counts.extra.at[level].add(extra),
+            counts.dropped.at[level].add(done.n_dropped),
+            groups,
+            counts.of_triangle.at[lists.triangle].add(each[:, None]),
+        )
+
+    return jax.lax.cond(hierarchy.counted, with_tests, lambda: counts)
