@@ -232,6 +232,18 @@ def test_predictions_cover_the_space_and_hold_the_measured_times(tmp_path):
     assert set(result.models) == {"tiled_deferred", "volume_tiled_bvh"}
 
 
+@pytest.mark.parametrize("technique", ["ptsv", "volume_tiled_bvh"])
+def test_what_compiles_to_be_counted_is_not_counted_for_predictions_alone(tmp_path, technique):
+    """A budget that ends before the search chooses: the rest of a shadow technique's space stays uncounted."""
+    space = Space((technique,), {technique: {"tile_px": (4, 8, 16, 32), "branching": (2, 4, 8, 16, 32)}})
+    workload = Synthetic(SHADING_BOUND)
+    result = search(space, workload, tmp_path / "measurements.jsonl", Budget(measurements=2))
+    predicted = [p.configuration for p in result.predictions]
+    of_space = [c for c in space.configurations() if c in workload.counted]
+    assert predicted == of_space and set(of_space) >= set(workload.measured) & set(space.configurations())
+    assert 2 < len(of_space) < len(space) if technique == "ptsv" else len(of_space) == len(space)
+
+
 def test_every_choice_is_made_from_all_that_is_known(tmp_path, monkeypatch):
     workload = Synthetic(SHADING_BOUND, hidden=erratic)
     known: list[tuple[int, int]] = []
