@@ -104,14 +104,17 @@ def search(
     run = SearchRun(space, workload, Path(record_path), budget, objective, max_error, progress, clock)
     hopeful, not_measured = _hopeful(space, run, keep)
 
-    design = initial_design(hopeful, run.counts, seed)
-    defaults, spread = design[: len(hopeful.techniques)], design[len(hopeful.techniques) :]
+    defaults = [hopeful.default(name) for name in hopeful.techniques]
     # Thrifty ones first: what is there to beat is then known when the slow ones are measured.
     in_budget = all(run.measure(candidate) for candidate in sorted(defaults, key=run.main_work))
     explored, not_explored = _explored(hopeful, run)
 
     share = 1 - _ACCURACY_SHARE
-    in_budget = in_budget and all(run.measure(c, share) for c in spread if c.technique in explored.techniques)
+    design: list[Configuration] = []
+    candidates = initial_design(explored, run.counts, seed)
+    while in_budget and (candidate := next(candidates, None)) is not None:
+        design.append(candidate)
+        in_budget = run.measure(candidate, share) and run.spent < share
     stop_reason = f"the budget of {budget} was used"
     while in_budget:
         if run.fruitless(explored, design) >= PATIENCE:
