@@ -35,6 +35,8 @@ class ShadowFrame(eqx.Module):
     - `vertex_m`: float64, world space, components apart; `view_from_world`: float64, its rotation.
     - `eye_m`, `light_m`: float64, world space; a directional light is a unit vector toward it.
     - `culls_front`: triangles that face the light cast nothing.
+    - `counted`: whether the tests of a walk are counted. Traced: a walk compiles for seconds, and the program that was
+      counted is the one that is timed.
     """
 
     positions: Positions
@@ -48,6 +50,7 @@ class ShadowFrame(eqx.Module):
     light_m: Float[Array, " 3"]
     bias_m: Float[Array, ""]
     culls_front: Bool[Array, ""]
+    counted: Bool[Array, ""]
     directional: bool = eqx.field(static=True)
 
 
@@ -95,7 +98,8 @@ class ShadowPlan:
 
 
 class ShadowCounts(eqx.Module):
-    """What a walk did, 64 bits; one entry a level of nodes, the root's children first.
+    """What a walk did, 64 bits; one entry a level of nodes, the root's children first. Where nothing is counted all are
+    zero but what the capacities must hold.
 
     - `node_tests`: (existing child, triangle) pairs tested; `accepted`, `refined`: of these; `dropped`: what would be
       refined, into children that lie in shadow; the rest is rejected.
@@ -136,7 +140,7 @@ class ShadowMask(eqx.Module):
 
     - `shadowed`: false where nothing is tested.
     - `overflowed`: a list did not fit its capacity: the mask is thrown away, never used.
-    - `tests`: triangles in the lists that each sample's tile or cluster was tested against.
+    - `tests`: triangles in the lists that each sample's tile or cluster was tested against, where tests are counted.
     """
 
     shadowed: Bool[Array, "runs 32"]
@@ -208,6 +212,7 @@ def shadow_frame(
     receives: np.ndarray | None = None,
     front_faces: FrontFaces = "cast",
     positions: Positions | None = None,
+    counted: bool = True,
 ) -> ShadowFrame:
     """What a shadow program starts from.
 
@@ -234,5 +239,11 @@ def shadow_frame(
             light_m=put(light.homogeneous[:3]),
             bias_m=put(np.float64(bias_m)),
             culls_front=put(np.bool_(front_faces == "culled")),
+            counted=put(np.bool_(counted)),
             directional=light.directional,
         )
+
+
+def uncounted(frame: ShadowFrame) -> ShadowFrame:
+    """The same frame for a program that is timed alone: what counting takes is no part of it."""
+    return eqx.tree_at(lambda f: f.counted, frame, np.bool_(False))

@@ -23,6 +23,7 @@ from vtfs.shadow_mask import (
     casters_on_device,
     default_bias_m,
     shadow_frame,
+    uncounted,
 )
 from vtfs.shadow_volumes.cluster_hierarchy import cluster_hierarchy
 from vtfs.shadow_volumes.full_tree import n_cells
@@ -140,7 +141,7 @@ def shadow_program(technique: str, plan: ShadowPlan) -> Callable[[ShadowFrame], 
     """The program that is timed: mask and overflow alone, so that XLA deletes the counting."""
 
     def run(frame: ShadowFrame) -> tuple[Any, Any]:
-        mask = SHADOW_TECHNIQUES[technique](frame, plan)
+        mask = SHADOW_TECHNIQUES[technique](uncounted(frame), plan)
         return mask.shadowed, mask.overflowed
 
     return jax.jit(run)

@@ -27,6 +27,7 @@ from vtfs.shadow_mask import (
     edge_list,
     facing_samples,
     shadow_frame,
+    uncounted,
 )
 from vtfs.shadow_references import ShadowRays, brute_force, classify, facing_light, kept_casters, view_points_m
 from vtfs.shadow_techniques import cast_shadows, fitted, on_host, run_program, shadow_grid, shadow_program
@@ -394,6 +395,28 @@ def test_a_restart_level_that_is_not_there_is_refused_by_name():
         restart_level(plan, 4)
     with pytest.raises(InputError, match=r"passes=2: the tree has one level"):
         restart_level(plan, 1)
+
+
+@pytest.mark.parametrize(
+    ("technique", "plan"), [("cluster_hierarchy", CLUSTERS), ("ptsv", TILES), ("z_fail", CLUSTERS)]
+)
+def test_a_walk_that_is_not_counted_is_the_same_walk(technique, plan):
+    camera, rng = a_camera(SMALL), np.random.default_rng(6)
+    samples = surface_samples(camera, 6)
+    casters = balls(camera, rng) if technique == "z_fail" else soup(camera, rng)
+    light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
+    frame = shadow_frame(samples, casters_on_device(casters), light, shadow_grid(samples, plan.tile_px), bias_m)
+    counted, alone = run_program(technique, plan, frame), run_program(technique, plan, uncounted(frame))
+    assert np.array_equal(counted.shadowed, alone.shadowed) and np.asarray(counted.shadowed).any()
+    assert not counted.overflowed and not alone.overflowed
+    # What the capacities must hold is known all the same.
+    assert np.array_equal(counted.counts.groups, alone.counts.groups) and np.asarray(alone.counts.groups).any()
+    assert int(counted.counts.sample_tests) > 0 and np.asarray(counted.tests).any()
+    for name in ("node_tests", "refined", "sample_tests", "sample_tests_in_cluster", "tests_of_triangle"):
+        assert np.asarray(getattr(counted.counts, name)).any() and not np.asarray(getattr(alone.counts, name)).any()
+    assert not np.asarray(alone.tests).any()
+    small = replace(plan, leaf_groups=4)
+    assert run_program(technique, small, uncounted(frame)).overflowed
 
 
 def test_what_does_not_fit_is_refused_and_run_again_not_cut():

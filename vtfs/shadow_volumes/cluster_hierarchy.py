@@ -39,5 +39,5 @@ def shadow_build(frame: ShadowFrame, plan: ShadowPlan) -> Hierarchy:
     n_in_tile = jnp.sum(samples.receives, axis=1, dtype=jnp.int32)[clusters.tile]
     return Hierarchy(
         samples, table, clusters.tile, clusters.of_sample, clusters.members, n_in_tile, clusters.n_clusters,
-        clusters.n_blocks, overflowed, is_frustum=False,
+        clusters.n_blocks, overflowed, frame.counted, is_frustum=False,
     )  # fmt: skip

@@ -52,7 +52,7 @@ class Hierarchy(eqx.Module):
     - `tile_of_item`: whose samples are tested at each item; `item_of_sample`: whose bits a sample reads.
     - `members`: bits of the samples of each item itself.
     - `n_in_tile`: samples that receive shadow, of each item's tile.
-    - `n_items`: that exist; `n_blocks`: see `SampleClusters`.
+    - `n_items`: that exist; `n_blocks`: see `SampleClusters`; `counted`: see `ShadowFrame`.
     """
 
     samples: SampleTiles
@@ -64,6 +64,7 @@ class Hierarchy(eqx.Module):
     n_items: Int[Array, ""]
     n_blocks: Int[Array, ""]
     overflowed: Bool[Array, ""]
+    counted: Bool[Array, ""]
     is_frustum: bool = eqx.field(static=True)
 
 

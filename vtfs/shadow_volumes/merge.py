@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from vtfs.shadow_mask import ShadowCounts, ShadowMask
 from vtfs.shadow_volumes.hierarchy import Hierarchy
@@ -35,6 +35,14 @@ def mask_of(
     - `planes`: all arrays that say what casts, or their shapes: they are counted as bytes.
     """
     samples, nodes = hierarchy.samples, walk.counts
+    view = samples.viewport, samples.tile_px
+    in_mask = in_runs(shadowed, *view)
+
+    def counted() -> tuple[Int[Array, "runs 32"], Int[Array, ""]]:
+        return in_runs(walk.tests, *view), jnp.sum(walk.tests, dtype=jnp.int64)
+
+    nothing = jnp.zeros(in_mask.shape, jnp.int32), jnp.int64(0)
+    tests, tests_in_cluster = jax.lax.cond(hierarchy.counted, counted, lambda: nothing)
     counts = ShadowCounts(
         node_tests=nodes.node_tests,
         accepted=nodes.accepted,
@@ -42,7 +50,7 @@ def mask_of(
         dropped=nodes.dropped,
         extra_plane_tests=nodes.extra,
         sample_tests=walk.sample_tests,
-        sample_tests_in_cluster=jnp.sum(walk.tests, dtype=jnp.int64),
+        sample_tests_in_cluster=tests_in_cluster,
         dropped_samples=walk.dropped_samples,
         stencil_updates=jnp.int64(-1),
         tests_of_triangle=nodes.of_triangle[:-1],
@@ -54,9 +62,7 @@ def mask_of(
         n_casters=jnp.sum(casts, dtype=jnp.int32),
         bytes_held=jnp.array([_n_bytes(held) for held in (planes, *_tree_and_samples(hierarchy))], jnp.int64),
     )
-    view = samples.viewport, samples.tile_px
-    overflowed = walk.overflowed | hierarchy.overflowed
-    return ShadowMask(in_runs(shadowed, *view), overflowed, in_runs(walk.tests, *view), counts)
+    return ShadowMask(in_mask, walk.overflowed | hierarchy.overflowed, tests, counts)
 
 
 def _tree_and_samples(hierarchy: Hierarchy) -> tuple[Any, Any]:

@@ -137,7 +137,7 @@ def shadow_build(frame: ShadowFrame, plan: ShadowPlan) -> Hierarchy:
     samples = sample_tiles(_moved(frame, light_m(frame)), frame.receives, plan.tile_px)
     tile, _ = tile_order(samples.columns, samples.rows)
     table = node_table(_tile_boxes(samples, tile), plan.branching, is_frustum=False)
-    return over_tiles(samples, table, is_frustum=False)
+    return over_tiles(samples, table, frame.counted, is_frustum=False)
 
 
 def shadow_traverse(polygons: StencilPolygons, hierarchy: Hierarchy, plan: ShadowPlan, by_failing: bool) -> StencilWalk:
