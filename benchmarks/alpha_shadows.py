@@ -1,29 +1,34 @@
 """Alpha casters: are they exact, what do they cost, and what do several samples a pixel gain?
 
-python benchmarks/alpha_shadows.py exactness [SIZE] [SCENE]   variants against float64, gallery scenes
-python benchmarks/alpha_shadows.py antialiasing [WxH]     4, 8, 16 samples, traced against extrapolated
-python benchmarks/alpha_shadows.py cost [WxH]             opaque alone, and with alpha casters, beside brute force
+python -m benchmarks.alpha_shadows exactness [SIZE] [SCENE]   variants against float64, gallery scenes
+python -m benchmarks.alpha_shadows antialiasing [WxH]     4, 8, 16 samples, traced against extrapolated
+python -m benchmarks.alpha_shadows cost [WxH] [FILE]      tests, of opaque casters alone and with alpha casters
+
+A row of `cost` is a line of FILE (alpha-cost.jsonl unless given), written as it is known and not counted again.
 """
 
 from __future__ import annotations
 
 import itertools
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
 
+from benchmarks.run_lines import RunLines
 from vtfs.alpha_casters import AlphaCasters, Blending, SceneCasters, scene_bias_m, scene_casters
 from vtfs.camera import Viewport
+from vtfs.device import keep_compiled_programs
 from vtfs.gallery import build_scene
 from vtfs.sample_patterns import extrapolated_sub_samples, resolved, traced_sub_samples
 from vtfs.scene import Scene
 from vtfs.shadow_casters import ShadowLight
 from vtfs.shadow_mask import ShadowPlan, facing_samples
 from vtfs.shadow_references import brute_force, classify, view_points_m
+from vtfs.shadow_techniques import shadow_sizes, with_shadow_sizes
 from vtfs.tracer import Tracer
 from vtfs.transmittance_references import ReferenceLight, brute_force_transmittance
 from vtfs.transmitted_light import transmitted_light
@@ -45,7 +50,10 @@ def main() -> None:
         exactness(int(size or 128), sys.argv[3] if len(sys.argv) > 3 else "")
     else:
         width, height = map(int, (size or "320x180").split("x"))
-        (antialiasing if question == "antialiasing" else cost)(Viewport(width, height))
+        if question == "antialiasing":
+            antialiasing(Viewport(width, height))
+        else:
+            cost(Viewport(width, height), Path(sys.argv[3] if len(sys.argv) > 3 else "alpha-cost.jsonl"))
 
 
 def light_in(scene: Scene, at: tuple[float, float, float]) -> ShadowLight:
@@ -154,33 +162,43 @@ def _coverage(views: tuple[ViewSamples, ...], casters: SceneCasters, light: Shad
 # --- cost -----------------------------------------------------------------------------------------------------------
 
 
-def cost(viewport: Viewport) -> None:
-    """Wall time of calls after the first: what alpha casters take beside opaque ones."""
-    print("| scene | opaque / alpha triangles | samples | casters | ms | test-and-set |")
-    print("| --- | --- | --- | --- | --- | --- |")
+_COLUMNS = ("scene", "triangles", "samples", "casters", "technique", "opaque", "alpha", "lit", "passed")
+
+
+def cost(viewport: Viewport, path: Path) -> None:
+    """Test-and-set operations of opaque and of alpha casters, samples that the former leave lit, and what passes both.
+
+    Each plan starts with the capacities that held the row before, so that a row compiles two programs.
+    """
+    keep_compiled_programs()
+    rows = RunLines(path)
     for name, frame, at in (("conservatory", 12, (0.45, 1.2, 0.8)), ("grove", 5, (0.4, 1.1, 0.6))):
         scene = build_scene(name)
         assert scene.cameras is not None
         samples = trace_view_samples(scene, replace(scene.cameras.camera(frame), viewport=viewport))
         whole, light = scene_casters(scene), light_in(scene, at)
         receives = facing_samples(samples, light)
-        opaque_too = f"{whole.opaque.n_triangles:,} / {whole.alpha.casters.n_triangles:,}"
-        for label, casters, blending in _caster_sets(whole):
-            for technique in ("ptsv", "cluster_hierarchy"):
-                ms, found = [], None
-                for _ in range(3):
-                    start = time.perf_counter()
-                    found = transmitted_light(
-                        technique, ShadowPlan(8, 8), samples, casters, light, blending, receives=receives
-                    )
-                    ms.append((time.perf_counter() - start) * 1e3)
-                assert found is not None
-                tests = found.opaque.counts["test_and_set"] + found.alpha.counts["test_and_set"]
-                print(
-                    f"| {name} | {opaque_too} | {int(receives.sum()):,} | {label}, {technique} | "
-                    f"{min(ms[1:]):,.0f} | {tests:,} |",
-                    flush=True,
+        n_triangles = f"{whole.opaque.n_triangles:,} / {whole.alpha.casters.n_triangles:,}"
+        for technique in ("ptsv", "cluster_hierarchy"):
+            plan = ShadowPlan(8, 8)
+            for label, casters, blending in _caster_sets(whole):
+                key = f"{name} {viewport.width_px}x{viewport.height_px} {technique} {label}"
+                if key in rows.known():
+                    continue
+                found = transmitted_light(technique, plan, samples, casters, light, blending, receives=receives)
+                plan = with_shadow_sizes(
+                    plan, tuple(map(max, shadow_sizes(found.opaque.plan), shadow_sizes(found.alpha.plan)))
                 )
+                passed = float(found.transmittance[receives].mean())
+                row = (
+                    name, n_triangles, int(receives.sum()), label, technique, found.opaque.counts["test_and_set"],
+                    found.alpha.counts["test_and_set"], found.alpha.counts["samples"], round(passed, 4),
+                )  # fmt: skip
+                rows.add({"key": key, **dict(zip(_COLUMNS, row, strict=True))})
+                print(rows.lines[-1], flush=True)
+    print(f"| {' | '.join(_COLUMNS)} |\n|{' --- |' * len(_COLUMNS)}")
+    for row in rows.lines:
+        print("| " + " | ".join(f"{v:,}" if isinstance(v, int) else str(v) for v in map(row.get, _COLUMNS)) + " |")
 
 
 def _caster_sets(whole: SceneCasters) -> Iterator[tuple[str, SceneCasters, Blending]]:

@@ -42,6 +42,7 @@ COUNT_MEANINGS = {
     "refined": "nodes that go on to their children",
     "dropped": "tests of nodes that feedback spares",
     "sample_tests": "samples tested against a triangle",
+    "rejected_nodes": "nodes that lie in no volume",
     "dropped_nodes": "tests of nodes that feedback spares",
     "dropped_samples": "tests of samples that feedback spares",
     "tests_of_largest": "tests of the 1,024 triangles with the most: how unevenly the work lies",
@@ -50,6 +51,10 @@ COUNT_MEANINGS = {
     "extra_plane_tests": "tests of the extra planes",
     "bytes_moved": "bytes read and written",
     "memory": "bytes held",
+    "memory_planes": "of them by the planes of all shadow volumes",
+    "memory_tree": "by the tree over tiles or clusters",
+    "memory_lists": "by the lists of triangles at its nodes",
+    "memory_samples": "by the samples in tiles, with their bits",
     "divergence": "32 times the longest list of each run of 32 samples",
     "dropped_at_cap": "lights lost at a cap per cell",
 }

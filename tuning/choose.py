@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -83,26 +83,28 @@ def is_timed(measurement: Measurement) -> bool:
     )
 
 
-def initial_design(space: Space, counts_of: CountsOf, seed: int = 0, per_technique: int = 3) -> list[Configuration]:
+def initial_design(space: Space, counts_of: CountsOf, seed: int = 0, per_technique: int = 3) -> Iterator[Configuration]:
     """Each technique's default, also where it is not in the space; then, in turns, a few that fill its space.
 
     Those are the configurations next to the points of a Latin hypercube over the ranks of the values. What would
-    do the same work as one before it is left out.
+    do the same work as one before it is left out. Counted one by one, as they are asked for: a shadow technique's
+    counts compile for seconds.
     """
-    design = [space.default(technique) for technique in space.techniques]
-    seen = {work_done(candidate, counts_of(candidate)) for candidate in design}
-    by_technique = []
-    for technique in space.techniques:
-        spread: list[Configuration] = []
+    defaults = [space.default(technique) for technique in space.techniques]
+    yield from defaults
+    seen = {work_done(candidate, counts_of(candidate)) for candidate in defaults}
+
+    def spread(technique: str) -> Iterator[Configuration]:
         for candidate in _space_filling(space, technique, seed, per_technique):
             work = work_done(candidate, counts_of(candidate))
             if counts_of(candidate) and work not in seen:
                 seen.add(work)
-                spread.append(candidate)
-        by_technique.append(spread)
-    for turn in range(per_technique):
-        design += [spread[turn] for spread in by_technique if turn < len(spread)]
-    return design
+                yield candidate
+
+    spreads = [spread(technique) for technique in space.techniques]
+    for _ in range(per_technique):
+        for each in spreads:
+            yield from itertools.islice(each, 1)
 
 
 def choose_next(

@@ -19,8 +19,8 @@ class Measurement:
     """One configuration on one scene. Failures are measurements too.
 
     - `frames`: which frames of the camera path, the one with the most work first.
-    - `stages_ms`: for each stage, for each frame, every repeat. `frame` is the fused program; the other
-      stages are timed apart and need not add up to it.
+    - `stages_ms`: for each stage, for each frame, every repeat. `frame` is the fused program, of shadow techniques
+      see `frame_program`; the other stages are timed apart and need not add up to it.
     - `counts`: one record a frame.
     - `error`: RMSE over RMS of the float64 reference, on `frames[0]`.
     """

@@ -110,6 +110,9 @@ class SearchRun:
                 self._record(candidate, None)
         return self._counts[candidate]
 
+    def has_counted(self, candidate: Configuration) -> bool:
+        return candidate in self._counts
+
     def main_work(self, candidate: Configuration) -> int:
         return sum(map(main_work, self.counts(candidate)))
 

@@ -55,7 +55,8 @@ class SearchResult:
     - `default`: the default of the best configuration's technique; `None` if it could not be timed.
     - `fastest_default`: the fastest default of all techniques.
     - `models`: by technique, then by stage.
-    - `predictions`: the whole space, but for techniques whose model cannot say how far off it is.
+    - `predictions`: the whole space, but for techniques whose model cannot say how far off it is, and of shadow
+      techniques what was counted for the search.
     - `not_measured`, `not_explored`: techniques that were left out, or measured at their default only, and why.
     """
 
@@ -103,14 +104,17 @@ def search(
     run = SearchRun(space, workload, Path(record_path), budget, objective, max_error, progress, clock)
     hopeful, not_measured = _hopeful(space, run, keep)
 
-    design = initial_design(hopeful, run.counts, seed)
-    defaults, spread = design[: len(hopeful.techniques)], design[len(hopeful.techniques) :]
+    defaults = [hopeful.default(name) for name in hopeful.techniques]
     # Thrifty ones first: what is there to beat is then known when the slow ones are measured.
     in_budget = all(run.measure(candidate) for candidate in sorted(defaults, key=run.main_work))
     explored, not_explored = _explored(hopeful, run)
 
     share = 1 - _ACCURACY_SHARE
-    in_budget = in_budget and all(run.measure(c, share) for c in spread if c.technique in explored.techniques)
+    design: list[Configuration] = []
+    candidates = initial_design(explored, run.counts, seed)
+    while in_budget and (candidate := next(candidates, None)) is not None:
+        design.append(candidate)
+        in_budget = run.measure(candidate, share) and run.spent < share
     stop_reason = f"the budget of {budget} was used"
     while in_budget:
         if run.fruitless(explored, design) >= PATIENCE:
@@ -195,11 +199,16 @@ def _predictions(
     space: Space, run: SearchRun, models: dict[str, dict[str, CostModel]], objective: Objective
 ) -> tuple[Prediction, ...]:
     predictions = []
+    # Each tile size and branching of a shadow technique compiles for seconds to be counted: too long for a chart alone,
+    # where the budget ended the search before it asked.
+    known = [
+        c for c in space.configurations() if c.technique not in SHADOW_NAMES or c in run.measured or run.has_counted(c)
+    ]
     for technique in space.techniques:
         model = models.get(technique, {}).get("frame")
         if model is None or not math.isfinite(model.loo_error):
             continue
-        candidates = [c for c in space.configurations() if c.technique == technique and run.counts(c)]
+        candidates = [c for c in known if c.technique == technique and run.counts(c)]
         predicted = predict_ms(model, [run.counts(c) for c in candidates], objective)
         for candidate, ms in zip(candidates, map(float, predicted), strict=True):
             measurement = run.timed(candidate)

@@ -15,7 +15,7 @@ _OF_OUR_PROGRAM = frozenset({"batch", "shading_lanes", "shading_steps", "assign_
 """Of how this JAX implementation cuts up the work: another engine does not pay for them."""
 
 _NO_WORK = frozenset({"shading_blocks", "memory", "longest_list"})
-_CAP = "dropped_at_cap_"
+_NO_WORK_STEMS = ("dropped_at_cap_", "memory_")
 
 
 def of_our_program(names: Iterable[str]) -> tuple[str, ...]:
@@ -39,4 +39,4 @@ def explaining_columns(table: TimingTable) -> tuple[TimingTable, tuple[str, ...]
 
 
 def _is_no_work(name: str) -> bool:
-    return name in _NO_WORK or name.startswith(_CAP)
+    return name in _NO_WORK or name.startswith(_NO_WORK_STEMS)

@@ -27,6 +27,7 @@ from vtfs.frame_counts import FrameCounts, count
 from vtfs.frame_inputs import FrameInputs
 from vtfs.frame_sizes import NO_SIZES, CapacityError, Sizes
 from vtfs.input_error import InputError
+from vtfs.light_shadows import CastMask
 from vtfs.lights import Lights
 from vtfs.op_counts import ListLengths, OpCounts
 from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration
@@ -187,6 +188,8 @@ class SceneWorkload:
         sizes = self._sizes_of(config)
         taken.counts = tuple(self.counts_of_frame(config, i) for i in range(len(self._inputs)))
         started = time.perf_counter()
+        # Shadows before, as the frame and its stages may share their programs.
+        masks = self._cast(config) if REGISTRY[config.technique].casts_shadows else []
         # The frame and its stages are programs of their own: two cores compile them at once. After the default they
         # are compiled, and the stages are run where the configuration has not lost.
         new = is_listed(config) and config == configuration(config.technique)
@@ -199,7 +202,7 @@ class SceneWorkload:
             return "overflow", "a frame no longer fits the capacities that its sizing run found"
         valid = self._inputs[0].seen()
         if REGISTRY[config.technique].casts_shadows:
-            checked = self._check_masks(config)
+            checked = self._check_masks(config, masks)
             reference = checked.image
             if checked.wrong and not changes_shadows(config):
                 return "failed", checked.wrong
@@ -238,12 +241,15 @@ class SceneWorkload:
         taken.stages_ms = self._stages_ms(config, sizes, env) | {"frame": tuple(frames)}
         return "timed", ""
 
-    def _check_masks(self, config: Configuration) -> MaskCheck:
+    def _cast(self, config: Configuration) -> list[CastMask]:
+        plan = planned(config, self._sizes_of(config))
+        return cast_program(config.technique, plan)(self._inputs[0].shadows.tasks(config))
+
+    def _check_masks(self, config: Configuration, masks: list[CastMask]) -> MaskCheck:
         samples, shadows = self._path.samples[0], self._inputs[0].shadows
         if self._checker is None:
             key = (self.scene_key, f"frame {self.frames[0]}")
             self._checker = ShadowChecker(shadows, samples, self._path.lights, key)
-        masks = cast_program(config.technique, planned(config, self._sizes_of(config)))(shadows.tasks(config))
         return self._checker.check(config, masks_on_host(masks, samples), light_on_host(masks, self._inputs[0]))
 
     def _stages_ms(

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -166,7 +167,7 @@ def tile_and_slices(params: Mapping[str, Value], viewport: Viewport) -> tuple[tu
 
 def n_cells(grid: ClusterGrid, viewport: Viewport) -> int:
     """Cells of the grid, occupied or not; a host integer."""
-    columns, rows = grid.tiles(viewport)
+    columns, rows = jax.device_get(grid).tiles(viewport)  # on the host: each division there would be a program
     return int(columns) * int(rows) * int(grid.depth_slices)
 
 

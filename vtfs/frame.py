@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from vtfs.gbuffer import from_runs
 from vtfs.light_shadows import CastMask
 from vtfs.parameters import Configuration
 from vtfs.shadow_inputs import ShadowTask, alpha_receiving, receiving
-from vtfs.shadow_mask import ShadowMask, ShadowPlan
+from vtfs.shadow_mask import ShadowMask, ShadowPlan, uncounted
 from vtfs.shadow_stages import TRANSMIT
 from vtfs.shadow_techniques import (
     CastShadows,
@@ -77,8 +77,8 @@ def keep_result(env: dict[str, Any], stage: str, result: Any) -> None:
 def frame_program(technique: str, plan: Plan, has_transparent: bool) -> Callable[..., Any]:
     """All stages fused: from the inputs to the image and whether anything overflowed.
 
-    One program; of shadow techniques two, as shadows are found in float64 and shaded in float32: `cast_program`, and
-    from its masks to the image.
+    One program; of shadow techniques `cast_program` and one from its masks to the image, as shadows are found in
+    float64 and shaded in float32.
     """
     stages = REGISTRY[technique].stages_of(plan, has_transparent)
     casting = tuple(stage for stage in stages if stage.casting)
@@ -99,15 +99,40 @@ def _cast_mask(mask: ShadowMask) -> CastMask:
 
 
 def cast_program(technique: str, plan: Plan) -> Callable[[list[ShadowTask]], list[CastMask]]:
-    """From view samples to the mask of one light on one view, fused, and run for each of them."""
+    """From view samples to the mask of one light on one view, run for each of them.
+
+    Where levels loop, by the stages' own programs, which counted the configuration: a walk compiles for seconds, and
+    a call more costs a CPU next to nothing. Without loops fused.
+    """
     casting = tuple(stage for stage in REGISTRY[technique].stages_of(plan, False) if stage.casting)
-    return _for_each_shadow(_fused_casting(casting, Plan(shadow=plan.shadow, alpha=plan.alpha)))
+    own = Plan(shadow=plan.shadow, alpha=plan.alpha)
+    if plan.shadow is not None and plan.shadow.level_groups:
+        return _for_each_shadow(_fused_casting(casting, own))
+    return lambda tasks: [_cast_by_stages(casting, own, task) for task in tasks]
+
+
+def _cast_by_stages(stages: tuple[Stage, ...], plan: Plan, task: ShadowTask) -> CastMask:
+    opaque = [stage for stage in stages if stage.name != TRANSMIT]
+    mask = _cast_mask(_run_casting(opaque, plan, task))
+    return mask if len(opaque) == len(stages) else _run_transmit(stages[-1], plan, task, mask)[0]
+
+
+def _run_casting(stages: Sequence[Stage], plan: Plan, task: ShadowTask) -> ShadowMask:
+    """The mask of opaque casters, stage by stage: those that a setting does not change are compiled as they are."""
+    env: dict[str, Any] = {"shadow_tasks": [task]}
+    for stage in stages:
+        env[stage.name] = stage_program(stage, stage.narrowed(plan))(*(env[name] for name in stage.needs))
+    return env[stages[-1].name][0]
+
+
+def _run_transmit(stage: Stage, plan: Plan, task: ShadowTask, opaque: CastMask) -> tuple[CastMask, ShadowMask]:
+    return stage_program(stage, stage.narrowed(plan))([task], [opaque])[0]
 
 
 @functools.cache
 def _fused_casting(stages: tuple[Stage, ...], plan: Plan) -> Callable[[ShadowTask], CastMask]:
     def run(task: ShadowTask) -> CastMask:
-        env: dict[str, Any] = {"shadow_tasks": task}
+        env: dict[str, Any] = {"shadow_tasks": replace(task, frame=uncounted(task.frame))}
         for stage in stages:
             env[stage.name] = stage.run(stage.narrowed(plan), *(env[name] for name in stage.needs))
         if stages[-1].name == TRANSMIT:
@@ -218,17 +243,12 @@ class CastFrame:
 
 def cast_counted(config: Configuration, inputs: FrameInputs) -> CastFrame:
     """Cast all shadows of a frame, stage by stage, with capacities that hold them."""
-    tasks = inputs.shadows.tasks(config)
+    tasks = inputs.shadows.tasks(config, counted=True)
     all_stages = [stage for stage in REGISTRY[config.technique].stages if stage.casting]
     stages = [stage for stage in all_stages if stage.name != TRANSMIT]
 
     def run(plan: ShadowPlan, i: int) -> ShadowMask:
-        # Stage by stage: those that a setting does not change are compiled, and run, as they are.
-        env: dict[str, Any] = {"shadow_tasks": [tasks[i]]}
-        for stage in stages:
-            program = stage_program(stage, stage.narrowed(Plan(shadow=plan)))
-            env[stage.name] = program(*(env[name] for name in stage.needs))
-        return env[stages[-1].name][0]
+        return _run_casting(stages, Plan(shadow=plan), tasks[i])
 
     frames = [receiving(task) for task in tasks]
     plan, masks = fitted_to_all(config.technique, shadow_plan(config), frames, run=run)
@@ -240,8 +260,7 @@ def cast_counted(config: Configuration, inputs: FrameInputs) -> CastFrame:
     left: dict[int, CastMask] = {}
 
     def run_alpha(plan: ShadowPlan, i: int) -> ShadowMask:
-        program = stage_program(transmit, transmit.narrowed(Plan(alpha=plan)))
-        left[i], mask = program([tasks[i]], [cast[i]])[0]
+        left[i], mask = _run_transmit(transmit, Plan(alpha=plan), tasks[i], cast[i])
         return mask
 
     alpha_frames = [alpha_receiving(task, mask.shadowed) for task, mask in zip(tasks, cast, strict=True)]

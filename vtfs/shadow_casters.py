@@ -23,9 +23,7 @@ FrontFaces = Literal["cast", "culled"]
 class Casters:
     """Triangles that cast shadows, in world space.
 
-    - `vertices_m`: float64 `[V, 3]`; `triangles`: int32 `[T, 3]`. Triangles that share an edge must share its vertices
-      for
-      their volumes to be watertight.
+    - `vertices_m`: float64 `[V, 3]`; `triangles`: int32 `[T, 3]`. Vertices at one place need not be shared (`welded`).
 
     **Raises:** `InputError` where a vertex of a triangle is not finite or an index is out of range.
     """
@@ -63,6 +61,21 @@ class Casters:
             return 0.0
         used = self.vertices_m[self.triangles.ravel()]
         return float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
+
+
+def welded(vertices_m: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The same triangles, each corner by the first vertex at its place, int32 `[T, 3]`.
+
+    A mesh has several vertices at one place where normals, texture coordinates or materials differ. Only by its place
+    do both triangles of an edge see that it is one: they get the same planes, and a stencil draws no side there.
+    """
+    place = vertices_m + 0.0  # -0 is 0
+    order = np.lexsort(place.T)  # stable: of one place the first vertex comes first
+    is_first = np.ones(len(order), bool)
+    is_first[1:] = (place[order[1:]] != place[order[:-1]]).any(axis=1)
+    first = np.empty(len(order), np.int32)
+    first[order] = order[is_first][np.cumsum(is_first) - 1]
+    return first[triangles]
 
 
 @dataclass(frozen=True)

@@ -174,8 +174,12 @@ class FrameShadows:
         """Of random bits: every view and light has its own."""
         return self.scene.seed % 2**32, view * MAX_SHADOW_LIGHTS + slot
 
-    def tasks(self, config: Configuration) -> list[ShadowTask]:
+    def tasks(self, config: Configuration, counted: bool = False) -> list[ShadowTask]:
         """For each view the tasks of all slots.
+
+        **Arguments:**
+
+        - `counted`: see `ShadowFrame`.
 
         **Raises:** `InputError`, see `ShadowScene.blending`.
         """
@@ -187,7 +191,9 @@ class FrameShadows:
         tasks = []
         for v, (view, (positions, normal)) in enumerate(zip(self.views, self._on_device, strict=True)):
             for k, (light, range_m) in enumerate(zip(self.lights, self.range_m, strict=True)):
-                frame = shadow_frame(view, self.scene.on_device, light, grid, self.bias_m, None, front_faces, positions)
+                frame = shadow_frame(
+                    view, self.scene.on_device, light, grid, self.bias_m, None, front_faces, positions, counted
+                )
                 alpha = self._alpha_task(casting, v, k)
                 tasks.append(ShadowTask(frame, normal, jax.device_put(np.float32(range_m)), alpha))
         return tasks

@@ -14,7 +14,7 @@ from vtfs.alpha_casters import Casting
 from vtfs.cluster_grid import ClusterGrid
 from vtfs.gbuffer import Fragments, Positions, to_runs
 from vtfs.layers import Layers
-from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight
+from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight, welded
 from vtfs.shadow_volumes.planes import Extra, Precision
 
 if TYPE_CHECKING:
@@ -35,6 +35,8 @@ class ShadowFrame(eqx.Module):
     - `vertex_m`: float64, world space, components apart; `view_from_world`: float64, its rotation.
     - `eye_m`, `light_m`: float64, world space; a directional light is a unit vector toward it.
     - `culls_front`: triangles that face the light cast nothing.
+    - `counted`: whether the tests of a walk are counted. Traced: a walk compiles for seconds, and the program that was
+      counted is the one that is timed.
     """
 
     positions: Positions
@@ -48,6 +50,7 @@ class ShadowFrame(eqx.Module):
     light_m: Float[Array, " 3"]
     bias_m: Float[Array, ""]
     culls_front: Bool[Array, ""]
+    counted: Bool[Array, ""]
     directional: bool = eqx.field(static=True)
 
 
@@ -98,7 +101,8 @@ class ShadowPlan:
 
 
 class ShadowCounts(eqx.Module):
-    """What a walk did, 64 bits; one entry a level of nodes, the root's children first.
+    """What a walk did, 64 bits; one entry a level of nodes, the root's children first. Where nothing is counted all are
+    zero but what the capacities must hold.
 
     - `node_tests`: (existing child, triangle) pairs tested; `accepted`, `refined`: of these; `dropped`: what would be
       refined, into children that lie in shadow; the rest is rejected.
@@ -112,6 +116,7 @@ class ShadowCounts(eqx.Module):
     - `list_length`: triangles tested against each tile or cluster.
     - `n_items`: occupied tiles or clusters; `n_blocks`, `n_nodes`: what `clusters` and `nodes` must hold.
     - `n_casters`: triangles with a volume.
+    - `bytes_held`: by the planes of all volumes, by the tree, and by the samples with the bits of their tiles.
     """
 
     node_tests: Int[Array, " levels"]
@@ -131,6 +136,7 @@ class ShadowCounts(eqx.Module):
     n_blocks: Int[Array, ""]
     n_nodes: Int[Array, ""]
     n_casters: Int[Array, ""]
+    bytes_held: Int[Array, " 3"]
 
 
 class ShadowMask(eqx.Module):
@@ -138,7 +144,7 @@ class ShadowMask(eqx.Module):
 
     - `shadowed`: false where nothing is tested.
     - `overflowed`: a list did not fit its capacity: the mask is thrown away, never used.
-    - `tests`: triangles in the lists that each sample's tile or cluster was tested against.
+    - `tests`: triangles in the lists that each sample's tile or cluster was tested against, where tests are counted.
     """
 
     shadowed: Bool[Array, "runs 32"]
@@ -189,8 +195,8 @@ def edge_list(triangles: np.ndarray) -> np.ndarray:
 
 
 def casters_on_device(casters: Casters) -> CastersOnDevice:
-    """Upload casters; none at all become one triangle without area, as XLA cannot gather from nothing."""
-    vertices, triangles = casters.vertices_m, casters.triangles
+    """Upload casters, welded; none at all become one triangle without area, as XLA cannot gather from nothing."""
+    vertices, triangles = casters.vertices_m, welded(casters.vertices_m, casters.triangles)
     if not len(triangles):
         vertices, triangles = np.zeros((1, 3)), np.zeros((1, 3), np.int32)
     with jax.enable_x64(True):
@@ -210,6 +216,7 @@ def shadow_frame(
     receives: np.ndarray | None = None,
     front_faces: FrontFaces = "cast",
     positions: Positions | None = None,
+    counted: bool = True,
 ) -> ShadowFrame:
     """What a shadow program starts from.
 
@@ -236,5 +243,11 @@ def shadow_frame(
             light_m=put(light.homogeneous[:3]),
             bias_m=put(np.float64(bias_m)),
             culls_front=put(np.bool_(front_faces == "culled")),
+            counted=put(np.bool_(counted)),
             directional=light.directional,
         )
+
+
+def uncounted(frame: ShadowFrame) -> ShadowFrame:
+    """The same frame for a program that is timed alone: what counting takes is no part of it."""
+    return eqx.tree_at(lambda f: f.counted, frame, np.bool_(False))

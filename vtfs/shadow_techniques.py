@@ -23,6 +23,7 @@ from vtfs.shadow_mask import (
     casters_on_device,
     default_bias_m,
     shadow_frame,
+    uncounted,
 )
 from vtfs.shadow_volumes.cluster_hierarchy import cluster_hierarchy
 from vtfs.shadow_volumes.full_tree import n_cells, require_room
@@ -32,7 +33,6 @@ from vtfs.shadow_volumes.sample_tiles import KEY_BITS
 from vtfs.shadow_volumes.z_fail import z_fail
 from vtfs.shadow_volumes.z_pass import z_pass
 from vtfs.view_samples import ViewSamples
-from vtfs.wide_tree import inner_level_nodes
 
 if TYPE_CHECKING:
     from vtfs.camera import Camera
@@ -143,7 +143,7 @@ def shadow_program(technique: str, plan: ShadowPlan) -> Callable[[ShadowFrame], 
     """The program that is timed: mask and overflow alone, so that XLA deletes the counting."""
 
     def run(frame: ShadowFrame) -> tuple[Any, Any]:
-        mask = SHADOW_TECHNIQUES[technique](frame, plan)
+        mask = SHADOW_TECHNIQUES[technique](uncounted(frame), plan)
         return mask.shadowed, mask.overflowed
 
     return jax.jit(run)
@@ -327,10 +327,11 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
       each
       sample and volume polygon that passes (z_pass) or fails (z_fail) the depth test; what the tiles cost stays apart.
     - `node_tests_0` ...: of them, on each level below the root; `accepted_*`, `refined_*`, `dropped_*` likewise, the
-      others are rejected. `dropped_nodes`, `dropped_samples`: pairs that feedback spares.
+      others are rejected: `rejected_nodes` in all. `dropped_nodes`, `dropped_samples`: pairs that feedback spares.
     - `tests_of_largest`: of the 1,024 triangles with the most tests: how unevenly the work lies.
     - `extra_plane_tests`: planes tested beyond the four of a volume.
-    - `memory`: bytes of the structures at their capacities.
+    - `memory`: bytes of all structures at their capacities: `memory_planes` of the volumes, `memory_tree`,
+      `memory_lists` of the levels that are held at once, `memory_samples` with the bits of their tiles.
     """
     counts = mask.counts
     nodes, accepted, refined, dropped, extra = (
@@ -348,6 +349,13 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
     updates = int(counts.stencil_updates)
     on_nodes = int(nodes.sum())
     lengths = np.asarray(counts.list_length).astype(np.int64)
+    planes, tree, on_samples = (int(n) for n in np.asarray(counts.bytes_held))
+    memory = {
+        "memory_planes": planes,
+        "memory_tree": tree,
+        "memory_lists": _bytes_of_lists(plan),
+        "memory_samples": on_samples,
+    }
     return {
         "samples": int(np.asarray(frame.receives).sum()),
         "casters": int(counts.n_casters),
@@ -357,12 +365,14 @@ def shadow_counts(mask: ShadowMask, frame: ShadowFrame, plan: ShadowPlan) -> dic
         "node_tests": on_nodes,
         "sample_tests": int(counts.sample_tests),
         "extra_plane_tests": 3 * int(extra.sum()),
+        "rejected_nodes": int(np.where(nodes > 0, nodes - accepted - refined - dropped, 0).sum()),
         "dropped_nodes": int(dropped.sum()),
         "dropped_samples": int(counts.dropped_samples),
         "tests_of_largest": int(of_triangle[-1_024:].sum()),
         "longest_list": int(lengths.max(initial=0)),
         "listed_pairs": int(lengths.sum()),
-        "memory": _memory(plan, frame),
+        "memory": sum(memory.values()),
+        **memory,
         **per_level,
     }
 
@@ -378,6 +388,9 @@ _OF_ALPHA = {
 }
 
 
+_MEMORY = ("memory", "memory_planes", "memory_tree", "memory_lists", "memory_samples")
+
+
 def shadows_counts(of_each: Sequence[dict[str, int]], of_alpha: Sequence[dict[str, int]] = ()) -> dict[str, int]:
     """Counts of the shadows of several lights and views: sums, but what is held or longest is that of the largest.
 
@@ -391,14 +404,14 @@ def shadows_counts(of_each: Sequence[dict[str, int]], of_alpha: Sequence[dict[st
     both = _shadows_counts(of_each)
     if of_alpha:
         alpha = _shadows_counts(of_alpha)
-        for name in ("test_and_set", "test_and_set_in_cluster", "memory"):
+        for name in ("test_and_set", "test_and_set_in_cluster", *_MEMORY):
             both[name] += alpha[name]
         both |= {own: alpha[name] for name, own in _OF_ALPHA.items()}
     return both
 
 
 def _shadows_counts(of_each: Sequence[dict[str, int]]) -> dict[str, int]:
-    largest = {"memory", "longest_list", "casters"}
+    largest = {*_MEMORY, "longest_list", "casters"}
     total = {
         name: (max if name in largest else sum)(counts.get(name, 0) for counts in of_each)
         for name in dict.fromkeys(name for counts in of_each for name in counts)
@@ -407,16 +420,11 @@ def _shadows_counts(of_each: Sequence[dict[str, int]]) -> dict[str, int]:
     return {names.get(name, name): value for name, value in total.items()}
 
 
-def _memory(plan: ShadowPlan, frame: ShadowFrame) -> int:
-    """Lists of all levels that are held at once, planes of all triangles, and the tree."""
-    groups = sum(plan.level_groups) if plan.level_groups else 2 * plan.groups
-    lists = 4 * (LANES * groups + LEAF_LANES * plan.leaf_groups) + 12 * plan.branching * groups
-    planes = frame.triangles.shape[0] * (8 * 13 + 4 * (13 + (9 if plan.extra != "off" else 0)))
-    if plan.nodes:
-        n_levels = sum(min(n, plan.nodes) for n in inner_level_nodes(plan.cells, plan.branching)) + plan.nodes
-        tree = 24 * plan.clusters + 28 * n_levels * plan.branching
-    else:
-        n_items = plan.cells or int(np.prod(frame.receives.shape)) // plan.tile_px**2
-        tree = 24 * n_items * plan.branching // (plan.branching - 1)
-    samples = 16 * int(np.prod(frame.receives.shape))
-    return lists + planes + tree + samples
+def _bytes_of_lists(plan: ShadowPlan) -> int:
+    """Lists of a level and of the next one, those of all levels where nothing loops; with what a level's tests found:
+    for each group and child its bits, and how many were found before it. Of two passes the pairs between them."""
+    groups, tested = 2 * plan.groups, plan.groups
+    if plan.level_groups:
+        groups, tested = sum(plan.level_groups), max(plan.level_groups)
+    lists = 4 * (LANES * groups + LEAF_LANES * plan.leaf_groups)
+    return lists + 12 * plan.branching * tested + 2 * 8 * plan.pairs

@@ -118,7 +118,7 @@ def test_the_front_is_what_an_obvious_loop_finds(points):
 @pytest.mark.parametrize("seed", range(5))
 def test_the_design_starts_with_the_defaults_and_spreads_over_the_values(seed):
     workload = Synthetic(SHADING_BOUND)
-    design = initial_design(WHOLE, workload.counts, seed)
+    design = list(initial_design(WHOLE, workload.counts, seed))
     assert design[:3] == [configuration(technique) for technique in WHOLE.techniques]
     assert len(design) == len(set(design))
     assert all(candidate in WHOLE for candidate in design)
@@ -130,14 +130,14 @@ def test_the_design_starts_with_the_defaults_and_spreads_over_the_values(seed):
     # Latin: three points in three strata; every batch and both values of branching, and two of four values at least.
     for name, n_least in {"batch": 3, "branching": 2, "tile_px": 2, "depth_slices": 2}.items():
         assert len({c[name] for c in tried}) >= n_least
-    assert design == initial_design(WHOLE, workload.counts, seed)
-    assert design != initial_design(WHOLE, workload.counts, seed + 1)
+    assert design == list(initial_design(WHOLE, workload.counts, seed))
+    assert design != list(initial_design(WHOLE, workload.counts, seed + 1))
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_larger_design_spreads_over_a_larger_space(seed):
     workload = Synthetic(SHADING_BOUND)
-    design = initial_design(LARGE, workload.counts, seed, per_technique=5)
+    design = list(initial_design(LARGE, workload.counts, seed, per_technique=5))
     per_technique = Counter(candidate.technique for candidate in design)
     assert 4 <= min(per_technique.values()) <= max(per_technique.values()) <= 6
     spread = [c for c in design[3:] if c.technique == "volume_tiled_bvh"]
@@ -146,18 +146,29 @@ def test_a_larger_design_spreads_over_a_larger_space(seed):
     assert len({c["batch"] for c in spread}) >= 4
     assert len({c["depth_slices"] for c in spread}) >= 3
     assert len({c["branching"] for c in spread}) >= 3
-    assert design == initial_design(LARGE, workload.counts, seed, per_technique=5)
+    assert design == list(initial_design(LARGE, workload.counts, seed, per_technique=5))
 
 
 def test_the_design_of_a_small_space_is_all_of_it():
     space = Space(("forward", "tiled_deferred"), {"tiled_deferred": {"tile_px": (8, 32)}})
     forward, tiled = configuration("forward"), configuration("tiled_deferred")
-    assert initial_design(space, Synthetic(SHADING_BOUND).counts) == [forward, tiled, tiled.replaced(tile_px=8)]
+    assert list(initial_design(space, Synthetic(SHADING_BOUND).counts)) == [forward, tiled, tiled.replaced(tile_px=8)]
+
+
+def test_a_design_counts_what_it_is_asked_for():
+    workload = Synthetic(SHADING_BOUND)
+    design = initial_design(WHOLE, workload.counts)
+    defaults = [next(design) for _ in WHOLE.techniques]
+    assert not workload.counted
+    first = next(design)
+    assert first not in defaults and workload.counted >= {*defaults, first}
+    n_counted = len(workload.counted)
+    assert list(design) and len(workload.counted) > n_counted
 
 
 def test_a_default_outside_the_space_is_in_the_design():
     space = Space(("tiled_deferred",), {"tiled_deferred": {"tile_px": (64, 128)}})
-    assert initial_design(space, Synthetic(SHADING_BOUND).counts)[0] == configuration("tiled_deferred")
+    assert next(initial_design(space, Synthetic(SHADING_BOUND).counts)) == configuration("tiled_deferred")
 
 
 def test_what_does_the_same_work_is_known_by_its_counts():

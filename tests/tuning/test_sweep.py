@@ -203,7 +203,7 @@ def test_choices_that_gain_nothing_end_a_search_that_is_never_sure(tmp_path):
     result = search(WHOLE, workload, path, Budget(measurements=60))
     assert result.stop_reason == f"the last {PATIENCE} choices gained nothing"
     assert of(result.best) == configuration("tiled_deferred")
-    design = initial_design(WHOLE, workload.counts)
+    design = list(initial_design(WHOLE, workload.counts))
     chosen = [c for c in workload.measured if c not in design and c.is_exact]
     assert len(chosen) in (PATIENCE, PATIENCE + 1)  # the last choice may be of two
     again = Synthetic({}, hidden=workload.hidden)
@@ -230,6 +230,19 @@ def test_predictions_cover_the_space_and_hold_the_measured_times(tmp_path):
         assert (p.measured_ms is not None) == (p.configuration in workload.measured)
     assert any(p.measured_ms is None for p in result.predictions) or len(workload.measured) >= len(SMALL)
     assert set(result.models) == {"tiled_deferred", "volume_tiled_bvh"}
+
+
+@pytest.mark.parametrize("technique", ["ptsv", "volume_tiled_bvh"])
+def test_what_compiles_to_be_counted_is_not_counted_for_predictions_alone(tmp_path, technique):
+    """A budget that ends before the search chooses: the rest of a shadow technique's space stays uncounted."""
+    space = Space((technique,), {technique: {"tile_px": (4, 8, 16, 32), "branching": (2, 4, 8, 16, 32)}})
+    workload = Synthetic(SHADING_BOUND)
+    result = search(space, workload, tmp_path / "measurements.jsonl", Budget(measurements=3))
+    predicted = [p.configuration for p in result.predictions]
+    measured = [c for c in space.configurations() if c in workload.measured]
+    assert 1 < len(measured) < len(space)
+    assert predicted == (measured if technique == "ptsv" else list(space.configurations()))
+    assert technique != "ptsv" or workload.counted == set(workload.measured)
 
 
 def test_every_choice_is_made_from_all_that_is_known(tmp_path, monkeypatch):
@@ -362,7 +375,7 @@ def test_where_everything_fails_one_line_says_so(tmp_path):
     path = tmp_path / "measurements.jsonl"
     workload = Synthetic({}, fails=lambda _: True)
     # The whole design is tried, and nothing after it: there is no time to go by.
-    design = initial_design(SMALL, workload.counts)
+    design = list(initial_design(SMALL, workload.counts))
     message = rf"none of {len(design)} configurations .*out_of_memory: 9 GB needed.*smaller size"
     with pytest.raises(InputError, match=message):
         search(SMALL, workload, path, Budget(measurements=len(design) + 2))

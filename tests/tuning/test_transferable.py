@@ -7,7 +7,7 @@ from tuning.timing_table import TimingTable
 from tuning.transferable import explaining_columns
 
 COUNTS = ("lighting_computations", "cells_total", "shading_steps")
-NO_WORK = ("memory", "longest_list", "dropped_at_cap_64", "shading_blocks")
+NO_WORK = ("memory", "memory_tree", "longest_list", "dropped_at_cap_64", "shading_blocks")
 
 
 def a_table(names: tuple[str, ...], labels: tuple[str, ...]) -> TimingTable:

@@ -13,13 +13,13 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.strategies import SMALL, a_camera, seeds, surface_samples
+from tests.strategies import SMALL, a_camera, samples_at, seeds, surface_samples
 from vtfs.camera import Camera, Viewport, load_cameras
 from vtfs.gallery import build_scene
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.scene import load_scene
-from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, opaque_casters
+from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, opaque_casters, welded
 from vtfs.shadow_mask import (
     ShadowPlan,
     casters_on_device,
@@ -27,6 +27,7 @@ from vtfs.shadow_mask import (
     edge_list,
     facing_samples,
     shadow_frame,
+    uncounted,
 )
 from vtfs.shadow_references import ShadowRays, brute_force, classify, facing_light, kept_casters, view_points_m
 from vtfs.shadow_techniques import cast_shadows, fitted, on_host, run_program, shadow_grid, shadow_program
@@ -108,14 +109,14 @@ def test_a_triangle_soup_shadows_what_brute_force_says(technique, plan, seed, ki
     assert (cast(technique, plan, samples, shuffled, light, bias_m, front_faces).shadowed == found.shadowed).all()
 
 
-def test_a_directional_light_shadows_what_brute_force_says():
-    plan = replace(CLUSTERS, extra="vertex")
+@pytest.mark.parametrize(("technique", "plan"), [("cluster_hierarchy", CLUSTERS), ("ptsv", TILES)])
+def test_a_directional_light_shadows_what_brute_force_says(technique, plan):
     camera = a_camera(SMALL, eye_m=(1e6, -3e5, 1e6))
     for seed in range(4):
         rng = np.random.default_rng(seed)
         samples, casters, light = surface_samples(camera, seed), soup(camera, rng), light_of(camera, "directional", rng)
         bias_m = default_bias_m(casters)
-        mask = cast("cluster_hierarchy", plan, samples, casters, light, bias_m).shadowed
+        mask = cast(technique, plan, samples, casters, light, bias_m).shadowed
         assert_equal_outside_the_bands(mask, samples, casters, light, bias_m, 0.01)
 
 
@@ -133,14 +134,15 @@ def balls(camera: Camera, rng: np.random.Generator) -> Casters:
     return Casters(np.concatenate(parts) + camera.eye_m, np.concatenate(triangles))
 
 
+@pytest.mark.parametrize("kinds", [("inside", "far", "near"), ("directional",)], ids=["point", "directional"])
 @pytest.mark.parametrize("technique", ["z_pass", "z_fail"])
-def test_stencils_shadow_what_brute_force_says(technique):
+def test_stencils_shadow_what_brute_force_says(technique, kinds):
     n_shadowed = 0
     for seed in range(8):
         rng = np.random.default_rng(seed)
         camera = a_camera(SMALL, eye_m=((1.0, 2.0, 3.0), (1e6, -3e5, 1e6))[seed % 2])
         samples, casters = surface_samples(camera, seed), balls(camera, rng)
-        light = light_of(camera, ("inside", "far", "near")[seed % 3], rng)
+        light = light_of(camera, kinds[seed % len(kinds)], rng)
         bias_m = default_bias_m(casters)
         receives = samples.valid.copy()
         if technique == "z_pass":  # it has no caps: only what the eye sees is right
@@ -167,6 +169,17 @@ def test_each_edge_is_listed_once_with_its_two_triangles():
     closed = edge_list(np.array(ball.faces, np.int32))
     assert len(closed) == len(ball.edges_unique) and (closed[:, 2:] >= 0).all()
     assert ((closed[:, 2] + closed[:, 3]) % 2 == 1).all()  # neighbours run along their edge in opposite directions
+    # Where each triangle has vertices of its own, as at the seams of textures, the edges are the same.
+    order = np.random.default_rng(0).permutation(ball.faces.size)
+    split = np.empty((ball.faces.size, 3))
+    split[order] = ball.vertices[ball.faces.ravel()]
+    split[split == 0] = -0.0  # a place all the same
+    split[: len(split) // 2] += 0.0
+    alone = order.reshape(-1, 3)
+    assert (edge_list(alone)[:, 3] < 0).all()
+    joined = edge_list(welded(split, alone))
+    assert len(joined) == len(closed) and (joined[:, 2:] >= 0).all()
+    assert (split[welded(split, alone)] == ball.vertices[ball.faces]).all()
 
 
 def bad_triangles(kind: str, light_m: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -235,7 +248,7 @@ TWICE = replace(CLUSTERS, passes=2, batch=64, pairs=2**12)
 VARIANTS = {
     "full tree": ("cluster_hierarchy", replace(CLUSTERS, tree="full", cells=2**12)),
     "batches, full tree": ("cluster_hierarchy", replace(CLUSTERS, batch=64, tree="full", cells=2**12)),
-    "two passes": ("cluster_hierarchy", replace(TWICE, level=2, feedback=False)),
+    "two passes": ("cluster_hierarchy", replace(TWICE, level=3, feedback=False)),
     "ptsv, two passes": ("ptsv", replace(TWICE, level=1, branching=4, extra="silhouette")),
 }
 
@@ -258,6 +271,10 @@ def test_variants_change_tests_and_not_the_mask():
         assert counts["node_tests"] == sum(counts[f"node_tests_{k}"] for k in levels)
         # No triangle is left out of the work of the largest 1,024, as there are only 200.
         assert counts["tests_of_largest"] == counts["node_tests"] + counts["sample_tests"]
+        tested = [k for k in levels if counts[f"node_tests_{k}"]]
+        ends = (counts[f"{kind}_{k}"] for kind in ("accepted", "refined", "dropped") for k in tested)
+        assert counts["rejected_nodes"] == counts["node_tests"] - sum(ends) > 0
+        assert counts["memory"] == sum(counts[f"memory_{part}"] for part in ("planes", "tree", "lists", "samples"))
         for k in levels:
             of_level = (counts[f"{kind}_{k}"] for kind in ("accepted", "refined", "dropped"))
             assert sum(of_level) <= counts[f"node_tests_{k}"] or counts[f"node_tests_{k}"] == 0
@@ -269,11 +286,80 @@ def test_variants_change_tests_and_not_the_mask():
     # What feedback spares is counted: nodes, and samples that earlier batches shadow.
     full, spared, plain, twice = (other.counts for other in found.values())
     # A compact tree has the nodes of the full one that hold a cluster: all the same tests, on all levels.
-    assert {k: v for k, v in full.items() if k != "memory"} == {k: whole.counts[k] for k in full if k != "memory"}
+    assert {k: full[k] for k in full if "memory" not in k} == {k: whole.counts[k] for k in full if "memory" not in k}
     assert plain["dropped_nodes"] == plain["dropped_samples"] == 0 < spared["dropped_samples"]
     assert min(spared["dropped_nodes"], whole.counts["dropped_nodes"], twice["dropped_nodes"]) > 0
     assert whole.counts["node_tests"] < plain["node_tests"]
     assert spared["sample_tests"] < whole.counts["sample_tests"] < plain["sample_tests"]
+
+
+@pytest.mark.parametrize(
+    ("technique", "plan", "planes", "nodes"),
+    [
+        # 13 float64 and 28 float32 a triangle and one that is none; 5 x 3 tiles have 32 places, all below the root.
+        ("ptsv", TILES, 216 * (N_TRIANGLES + 1), [1]),
+        # Relative to the light 6 float32 fewer; 4,096 keys have 512 nodes above, 64, 8 and the root: at most 64 each.
+        ("cluster_hierarchy", replace(CLUSTERS, cells=2**12, nodes=64), 192 * (N_TRIANGLES + 1), [64, 64, 8, 1]),
+    ],
+)
+def test_bytes_held_are_those_of_the_arrays(technique, plan, planes, nodes):
+    samples, light = surface_samples(a_camera(SMALL), 0), ShadowLight((1.0, 2.0, 3.0))
+    casters = soup(a_camera(SMALL), np.random.default_rng(0))
+    counts = cast(technique, plan, samples, casters, light, 1e-4).counts
+    # Besides the planes whether each triangle has any, how large it is, where the light is, and the bias.
+    assert counts["memory_planes"] == planes + N_TRIANGLES * (1 + 8) + 3 * 8 + 8
+    # Boxes of 24 bytes for each child; how many there are, of each node and level; of each item its tile, how many
+    # samples that has, and the bits of 64.
+    n_items = 32 if technique == "ptsv" else plan.clusters
+    boxes = sum(nodes) * (24 * plan.branching + 4) + 4 * len(nodes)
+    # Of a compact tree, where each child is, and each node below the root.
+    links = 4 * (sum(nodes) * plan.branching + sum(nodes) - 1 + n_items) if plan.nodes else 0
+    assert counts["memory_tree"] == boxes + links + n_items * (4 + 4 + 8)
+    # 15 tiles of 64 samples: a position, an item and a flag each; and the bits of the items.
+    assert counts["memory_samples"] == 15 * 64 * (12 + 4 + 1) + n_items * 8
+
+
+def roof(camera: Camera, depth_m: float) -> Casters:
+    """One triangle across the whole view, at a depth; and as many without area as a soup has others."""
+    corners = np.array([[-1e3, -1e3, -depth_m], [1e3, -1e3, -depth_m], [0, 2e3, -depth_m]])
+    vertices = np.zeros((N_VERTICES, 3))
+    vertices[:3] = corners @ camera.view_from_world[:3, :3]
+    triangles = np.zeros((N_TRIANGLES, 3), np.int32)
+    triangles[N_TRIANGLES // 2] = [0, 1, 2]
+    return Casters(vertices + camera.eye_m, triangles)
+
+
+def light_behind(camera: Camera, directional: bool = False) -> ShadowLight:
+    """50 m behind the camera, on its axis."""
+    way = np.array([0.0, 0.0, 50.0]) @ camera.view_from_world[:3, :3]
+    return ShadowLight(tuple(way) if directional else tuple(way + camera.eye_m), directional)
+
+
+@pytest.mark.parametrize("name", ["whole", "ptsv", *VARIANTS])
+def test_what_lies_in_shadow_as_a_whole_is_accepted_at_the_top(name):
+    camera = a_camera(SMALL)
+    samples, casters = surface_samples(camera, 6), roof(camera, -20.0)  # between the light and the camera
+    technique, plan = {"whole": ("cluster_hierarchy", CLUSTERS), "ptsv": ("ptsv", TILES), **VARIANTS}[name]
+    found = cast(technique, plan, samples, casters, light_behind(camera), 1e-3)
+    assert (found.shadowed == samples.valid).all()
+    counts = found.counts
+    top = next(k for k in range(9) if counts[f"node_tests_{k}"])
+    assert counts["casters"] == 1 < counts[f"accepted_{top}"] == counts["node_tests"]
+    assert counts["sample_tests"] == counts["extra_plane_tests"] == 0 == found.tests.sum()
+
+
+@pytest.mark.parametrize(
+    ("technique", "plan", "directional"),
+    [("cluster_hierarchy", CLUSTERS, False), ("ptsv", TILES, False), ("cluster_hierarchy", CLUSTERS, True)],
+)
+def test_what_lies_less_than_the_bias_behind_a_triangle_is_lit(technique, plan, directional):
+    camera, bias_m = a_camera(SMALL), 1e-2
+    depth_m = np.full((SMALL.height_px, SMALL.width_px), 5.0)
+    samples = samples_at(camera, depth_m, np.ones_like(depth_m, bool), np.random.default_rng(0))
+    light = light_behind(camera, directional)
+    for biases, is_shadowed in ((-3.0, False), (-0.3, False), (0.3, False), (1.5, True), (30.0, True)):
+        found = cast(technique, plan, samples, roof(camera, 5.0 - biases * bias_m), light, bias_m)
+        assert (found.shadowed == is_shadowed).all(), biases
 
 
 def test_what_blocks_most_of_the_light_is_known():
@@ -315,6 +401,28 @@ def test_a_restart_level_that_is_not_there_is_refused_by_name():
         restart_level(plan, 4)
     with pytest.raises(InputError, match=r"passes=2: the tree has one level"):
         restart_level(plan, 1)
+
+
+@pytest.mark.parametrize(
+    ("technique", "plan"), [("cluster_hierarchy", CLUSTERS), ("ptsv", TILES), ("z_fail", CLUSTERS)]
+)
+def test_a_walk_that_is_not_counted_is_the_same_walk(technique, plan):
+    camera, rng = a_camera(SMALL), np.random.default_rng(6)
+    samples = surface_samples(camera, 6)
+    casters = balls(camera, rng) if technique == "z_fail" else soup(camera, rng)
+    light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
+    frame = shadow_frame(samples, casters_on_device(casters), light, shadow_grid(samples, plan.tile_px), bias_m)
+    counted, alone = run_program(technique, plan, frame), run_program(technique, plan, uncounted(frame))
+    assert np.array_equal(counted.shadowed, alone.shadowed) and np.asarray(counted.shadowed).any()
+    assert not counted.overflowed and not alone.overflowed
+    # What the capacities must hold is known all the same.
+    assert np.array_equal(counted.counts.groups, alone.counts.groups) and np.asarray(alone.counts.groups).any()
+    assert int(counted.counts.sample_tests) > 0 and np.asarray(counted.tests).any()
+    for name in ("node_tests", "refined", "sample_tests", "sample_tests_in_cluster", "tests_of_triangle"):
+        assert np.asarray(getattr(counted.counts, name)).any() and not np.asarray(getattr(alone.counts, name)).any()
+    assert not np.asarray(alone.tests).any()
+    small = replace(plan, leaf_groups=4)
+    assert run_program(technique, small, uncounted(frame)).overflowed
 
 
 def test_what_does_not_fit_is_refused_and_run_again_not_cut():

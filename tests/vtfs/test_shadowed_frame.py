@@ -8,19 +8,23 @@ import pytest
 
 from tests import oracles
 from tests.strategies import a_camera, layered_samples, nearby_lights, surface_samples
+from tests.vtfs.test_frame import Compiles
 from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
-from vtfs.frame import image_on_host, render, run_stages
+from vtfs.frame import cast_counted, cast_program, image_on_host, render, run_stages
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
+from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.light_shadows import CastMask, shadow_bits
 from vtfs.lights import Lights, point_lights
 from vtfs.parameters import SHADOW_REFERENCES, TECHNIQUES, configuration
 from vtfs.reference import ViewShadows, forward_reference, largest_relative_difference
 from vtfs.shadow_casters import Casters
-from vtfs.shadow_inputs import FrameShadows, brightest_lights
+from vtfs.shadow_inputs import FrameShadows, brightest_lights, receiving
 from vtfs.shadow_maps import shadow_maps
 from vtfs.shadow_scene import ShadowScene
+from vtfs.shadow_techniques import fitted_to_all, shadow_plan
+from vtfs.techniques import Plan
 from vtfs.view_samples import ViewSamples
 
 SUNS = DirectionalLights(np.array([[0.3, 1.0, 0.4], [-2.0, 0.5, 0.0]]), np.array([[1.0, 0.9, 0.7], [0.2, 0.3, 0.6]]))
@@ -104,6 +108,24 @@ def test_a_technique_makes_the_image_that_the_references_make():
     stages, _ = run_stages(CAST, inputs)
     by_stages = image_on_host(stages["shade_transparent"], inputs).astype(np.float64)
     assert largest_relative_difference(image, by_stages, inputs.seen()) < 1e-6
+
+
+def test_the_walk_that_is_timed_is_the_program_that_was_counted():
+    inputs = a_frame(4, NO_DIRECTIONAL)
+    counted = cast_counted(CAST, inputs)
+    tasks = inputs.shadows.tasks(CAST)
+    with Compiles() as compiled:
+        masks = cast_program(CAST.technique, Plan(shadow=counted.opaque[0].plan))(tasks)
+    assert compiled.n == 0
+    # Without loops, as a GPU runs it, it is one program of its own.
+    plan, _ = fitted_to_all(CAST.technique, shadow_plan(CAST), list(map(receiving, tasks)), unrolled=True)
+    assert plan.level_groups
+    at_once = cast_program(CAST.technique, Plan(shadow=plan))(tasks)
+    for mask, fused, own in zip(masks, at_once, counted.opaque, strict=True):
+        shadowed = [from_runs(np.asarray(each.shadowed), inputs.viewport) for each in (mask, fused)]
+        assert (shadowed[0] == own.shadowed).all() and (shadowed[1] == own.shadowed).all()
+        assert not mask.overflowed and not fused.overflowed
+    assert any(own.shadowed.any() for own in counted.opaque)
 
 
 def test_counts_are_of_all_lights_and_views():

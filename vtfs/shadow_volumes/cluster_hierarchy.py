@@ -48,5 +48,5 @@ def shadow_build(frame: ShadowFrame, plan: ShadowPlan) -> Hierarchy:
     n_in_tile = jnp.sum(samples.receives, axis=1, dtype=jnp.int32)[clusters.tile]
     return Hierarchy(
         samples, table, clusters.tile, clusters.of_sample, clusters.members, n_in_tile, clusters.n_clusters,
-        clusters.n_blocks, n_nodes, overflowed, is_frustum=False,
+        clusters.n_blocks, n_nodes, overflowed, frame.counted, is_frustum=False,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Keys of the clusters, and the full tree: every cell at the place of its key, so that no list says where a child is."""
+"""Keys of the clusters, and the full tree: every cell at the place of its key, and no list that says where."""
 
 from __future__ import annotations
 

@@ -77,6 +77,7 @@ class Hierarchy(eqx.Module):
     - `members`: bits of the samples of each item itself.
     - `n_in_tile`: samples that receive shadow, of each item's tile.
     - `n_items`: that exist; `n_blocks`: see `SampleClusters`; `n_nodes`: what `plan.nodes` must hold.
+    - `counted`: see `ShadowFrame`.
     """
 
     samples: SampleTiles
@@ -89,6 +90,7 @@ class Hierarchy(eqx.Module):
     n_blocks: Int[Array, ""]
     n_nodes: Int[Array, ""]
     overflowed: Bool[Array, ""]
+    counted: Bool[Array, ""]
     is_frustum: bool = eqx.field(static=True)
 
 

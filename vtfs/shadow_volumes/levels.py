@@ -97,7 +97,7 @@ def descend(at: AtLevel, first: int, last: int, volume: Volumes, hierarchy: Hier
         def drop(accepted):
             return accepted | parent | was if plan.feedback else jnp.zeros_like(accepted)
 
-        # A root with one child is no node of the tree: only the capacity's rounding made it.
+        # One node below tells nothing apart: keys that no cluster has, or the capacity's rounding, made it.
         only = table.n_below[level] == 1
         row = jnp.asarray(table.first_row)[level]
         done = _split_level(lists, drop, row, only, lanes, capacity, volume, hierarchy, plan, chunk)
@@ -165,11 +165,19 @@ def _split_level(
     table, absent, b = hierarchy.table, volume.safe.shape[0], plan.branching
     bias_m = volume.bias_m.astype(jnp.float32)
 
-    def test(triangle, node):
+    def tested(triangle, node):
         row = table.row.at[first_row + node].get(mode="promise_in_bounds")
         planes = jax.tree.map(lambda c: c[:, None, :], volume.nodes.at(triangle))
         boxes = tuple(row[:, c, :, None] for c in range(6))
-        refined, goes_on, accepted = test_nodes(planes, boxes, hierarchy.is_frustum, bias_m)
+        return boxes, test_nodes(planes, boxes, hierarchy.is_frustum, bias_m)
+
+    def n_extra(triangle, node):
+        # Apart from the answers: one more reduction over the tests repeats them, and only counting needs it.
+        _, (refined, _, _) = tested(triangle, node)
+        return jnp.where(only, 0, jnp.sum(refined, dtype=jnp.int32))
+
+    def test(triangle, node):
+        boxes, (_, goes_on, accepted) = tested(triangle, node)
         # Wherever it is: in a full tree the only child need not be the first.
         pass_on = ~jnp.isnan(boxes[0]) & (triangle != absent)[:, None, :]
         goes_on, accepted = jnp.where(only, pass_on, goes_on), accepted & ~only
@@ -177,7 +185,9 @@ def _split_level(
         shift = jnp.arange(LANES, dtype=jnp.uint32)
         both = (goes_on.astype(jnp.uint32) << shift) | (accepted.astype(jnp.uint32) << (shift + LANES))
         both = jnp.sum(both, axis=-1, dtype=jnp.uint32)
-        extra = jnp.where(only, 0, jnp.sum(refined, dtype=jnp.int32))
+        extra = jnp.int32(0)
+        if plan.extra != "off":
+            extra = jax.lax.cond(hierarchy.counted, n_extra, lambda *_: extra, triangle, node)
         return both & jnp.uint32(2**LANES - 1), both >> LANES, extra
 
     if plan.level_groups:
@@ -188,22 +198,26 @@ def _split_level(
 def _with_level(
     counts: LevelCounts, lists: NodeLists, done: Split, level, hierarchy: Hierarchy, plan: ShadowPlan
 ) -> LevelCounts:
-    """The counts with those of one level."""
+    """The counts with those of one level. What the capacities must hold is always counted."""
     table = hierarchy.table
-    n_rows = lists.count.shape[0]
-    only = table.n_below[level] == 1
-    children = jax.lax.dynamic_slice_in_dim(table.n_children, jnp.asarray(table.first_row)[level], n_rows)
-    tests = jnp.where(only, 0, jnp.sum(lists.count.astype(jnp.int64) * children, dtype=jnp.int64))
-    extra = jnp.where(plan.extra != "off", done.extra, 0)
-    n_groups = lists.triangle.shape[0]
-    is_used = jnp.arange(n_groups, dtype=jnp.int32) < lists.n_groups
-    each = jnp.where(is_used & ~only, children[lists.nodes()], 0)
-    return LevelCounts(
-        counts.node_tests.at[level].add(tests),
-        counts.accepted.at[level].add(done.n_accepted),
-        counts.refined.at[level].add(jnp.where(only, 0, done.n_refined)),
-        counts.extra.at[level].add(extra),
-        counts.dropped.at[level].add(done.n_dropped),
-        counts.groups.at[level].max(lists.n_groups).at[level + 1].max(done.lists.n_groups),
-        counts.of_triangle.at[lists.triangle].add(each[:, None]),
-    )
+    groups = counts.groups.at[level].max(lists.n_groups).at[level + 1].max(done.lists.n_groups)
+    counts = eqx.tree_at(lambda counts: counts.groups, counts, groups)
+
+    def with_tests() -> LevelCounts:
+        n_rows = lists.count.shape[0]
+        only = table.n_below[level] == 1
+        children = jax.lax.dynamic_slice_in_dim(table.n_children, jnp.asarray(table.first_row)[level], n_rows)
+        tests = jnp.where(only, 0, jnp.sum(lists.count.astype(jnp.int64) * children, dtype=jnp.int64))
+        is_used = jnp.arange(lists.triangle.shape[0], dtype=jnp.int32) < lists.n_groups
+        each = jnp.where(is_used & ~only, children[lists.nodes()], 0)
+        return LevelCounts(
+            counts.node_tests.at[level].add(tests),
+            counts.accepted.at[level].add(done.n_accepted),
+            counts.refined.at[level].add(jnp.where(only, 0, done.n_refined)),
+            counts.extra.at[level].add(done.extra),
+            counts.dropped.at[level].add(done.n_dropped),
+            groups,
+            counts.of_triangle.at[lists.triangle].add(each[:, None]),
+        )
+
+    return jax.lax.cond(hierarchy.counted, with_tests, lambda: counts)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from vtfs.bit_lists import pack_bits
 from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
-from vtfs.shadow_volumes.hierarchy import Hierarchy, node_table
+from vtfs.shadow_volumes.hierarchy import Hierarchy, NodeTable, node_table
 from vtfs.shadow_volumes.merge import shadow_merge
-from vtfs.shadow_volumes.sample_tiles import depth_parts, sample_tiles, tile_order
+from vtfs.shadow_volumes.sample_tiles import SampleTiles, depth_parts, sample_tiles, tile_order
 from vtfs.shadow_volumes.volumes import Volumes, volumes
 from vtfs.shadow_volumes.walk import walk_volumes as shadow_traverse
 
@@ -33,10 +34,10 @@ def shadow_build(frame: ShadowFrame, plan: ShadowPlan) -> Hierarchy:
     """The depths of all tiles of samples that receive shadow, and the tree over them."""
     samples = sample_tiles(frame.positions, frame.receives, plan.tile_px)
     table = node_table(depth_parts(samples, frame.grid), plan.branching, is_frustum=True)
-    return over_tiles(samples, table, is_frustum=True)
+    return over_tiles(samples, table, frame.counted, is_frustum=True)
 
 
-def over_tiles(samples, table, is_frustum: bool) -> Hierarchy:
+def over_tiles(samples: SampleTiles, table: NodeTable, counted: Bool[Array, ""], is_frustum: bool) -> Hierarchy:
     """A tree whose items are the tiles, in the order of `tile_order`."""
     tile, place_of = tile_order(samples.columns, samples.rows)
     tiles, inside = jnp.asarray(np.maximum(tile, 0)), jnp.asarray(tile >= 0)
@@ -46,5 +47,5 @@ def over_tiles(samples, table, is_frustum: bool) -> Hierarchy:
     n_items = jnp.sum(n_in_tile > 0, dtype=jnp.int32)
     return Hierarchy(
         samples, table, tiles, item_of_sample, members, n_in_tile, n_items, jnp.int32(0), jnp.int32(0),
-        jnp.bool_(False), is_frustum,
+        jnp.bool_(False), counted, is_frustum,
     )  # fmt: skip

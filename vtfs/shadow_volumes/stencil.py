@@ -137,7 +137,7 @@ def shadow_build(frame: ShadowFrame, plan: ShadowPlan) -> Hierarchy:
     samples = sample_tiles(_moved(frame, light_m(frame)), frame.receives, plan.tile_px)
     tile, _ = tile_order(samples.columns, samples.rows)
     table = node_table(_tile_boxes(samples, tile), plan.branching, is_frustum=False)
-    return over_tiles(samples, table, is_frustum=False)
+    return over_tiles(samples, table, frame.counted, is_frustum=False)
 
 
 def shadow_traverse(polygons: StencilPolygons, hierarchy: Hierarchy, plan: ShadowPlan, by_failing: bool) -> StencilWalk:
@@ -161,7 +161,10 @@ def shadow_merge(
     shadowed = is_set(counts, plan.stencil, plan.around_eye and not by_failing)
     receives = hierarchy.samples.receives
     updates = jnp.sum(jnp.where(receives, counts.adding + counts.taking, 0), dtype=jnp.int64)
-    mask = mask_of(receives & shadowed, walk.walk, polygons.casts, hierarchy)
+    drawn = polygons.polygons
+    # Of one direction after the other, and gone by now: their shapes are known.
+    seen = jax.eval_shape(lambda drawn: _seen_volumes(drawn, drawn.crossing > 0, by_failing, plan.precision), drawn)
+    mask = mask_of(receives & shadowed, walk.walk, polygons.casts, (drawn, seen), hierarchy)
     return eqx.tree_at(lambda mask: mask.counts.stencil_updates, mask, updates)
 
 

@@ -99,7 +99,7 @@ def transmit(
     state = (jnp.int32(0), jnp.zeros((n_tiles, 1 + n_channels, n_samples), jnp.float64))
     _, total = jax.lax.while_loop(lambda state: state[0] < n_groups, loop, state)
     view = samples.viewport, samples.tile_px
-    mask = mask_of(total[:, 0] > 0, walk, volume.safe, hierarchy)
+    mask = mask_of(total[:, 0] > 0, walk, volume.safe, (volume, surfaces), hierarchy)
     logs = [in_runs(total[:, 1 + c], *view) for c in range(n_channels)]
     return Transmitted(tuple(jnp.where(mask.shadowed, 0, jnp.exp(log)).astype(jnp.float32) for log in logs), mask)
 

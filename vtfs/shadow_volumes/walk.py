@@ -168,6 +168,18 @@ def _no_walk(volume: Volumes, hierarchy: Hierarchy) -> Walk:
 
 def _with_samples(walk: Walk, at: AtLevel, volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> Walk:
     """The walk with the samples of what the lists of items reach."""
+    shadowed = walk.shadowed | held_samples(at.lists, volume, hierarchy, plan)
+    walk = eqx.tree_at(
+        lambda walk: (walk.counts, walk.overflowed),
+        walk,
+        (walk.counts.plus(at.counts), walk.overflowed | too_many(at.counts.groups, plan)),
+    )
+    walk = jax.lax.cond(hierarchy.counted, lambda: _with_sample_tests(walk, at, hierarchy, plan), lambda: walk)
+    return eqx.tree_at(lambda walk: walk.shadowed, walk, shadowed)
+
+
+def _with_sample_tests(walk: Walk, at: AtLevel, hierarchy: Hierarchy, plan: ShadowPlan) -> Walk:
+    """The walk with the counts of such samples' tests; `walk.shadowed` by earlier batches."""
     n_items = hierarchy.tile_of_item.shape[0]
     length = at.lists.count[:n_items]
     done = n_bits_set(walk.shadowed).sum(axis=1, dtype=jnp.int32) if plan.feedback else jnp.zeros_like(length)
@@ -176,18 +188,17 @@ def _with_samples(walk: Walk, at: AtLevel, volume: Volumes, hierarchy: Hierarchy
     own_length = length[jnp.clip(hierarchy.item_of_sample, 0, n_items - 1)]
     is_used = jnp.arange(at.lists.triangle.shape[0], dtype=jnp.int32) < at.lists.n_groups
     each = jnp.where(is_used, tested[jnp.minimum(at.lists.nodes(), n_items - 1)], 0)
-    of_triangle = at.counts.of_triangle.at[at.lists.triangle].add(each[:, None])
-    counts = eqx.tree_at(lambda counts: counts.of_triangle, at.counts, of_triangle)
+    of_triangle = walk.counts.of_triangle.at[at.lists.triangle].add(each[:, None])
     length64 = length.astype(jnp.int64)
     return Walk(
-        walk.shadowed | held_samples(at.lists, volume, hierarchy, plan),
-        walk.counts.plus(counts),
+        walk.shadowed,
+        eqx.tree_at(lambda counts: counts.of_triangle, walk.counts, of_triangle),
         walk.list_length + length,
         walk.tests + jnp.where(hierarchy.samples.receives & ~known, own_length, 0),
         walk.sample_tests + jnp.sum(length64 * tested),
         walk.dropped_samples + jnp.sum(length64 * done),
         walk.n_pairs,
-        walk.overflowed | too_many(at.counts.groups, plan),
+        walk.overflowed,
     )
 
 
@@ -242,13 +253,20 @@ def to_items(volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> tuple[A
         jnp.zeros(n_shadowed_places(hierarchy), bool), no_counts(n_levels, n_triangles),
     )  # fmt: skip
     at = descend(root, 0, n_levels, volume, hierarchy, plan)
-    n_items = hierarchy.tile_of_item.shape[0]
-    length = at.lists.count[:n_items]
-    own_length = length[jnp.clip(hierarchy.item_of_sample, 0, n_items - 1)]
-    none = _no_walk(volume, hierarchy)
-    walk = Walk(
-        none.shadowed, at.counts, length, jnp.where(hierarchy.samples.receives, own_length, 0),
-        jnp.sum(length.astype(jnp.int64) * hierarchy.n_in_tile), none.dropped_samples, none.n_pairs,
-        too_many(at.counts.groups, plan),
-    )  # fmt: skip
-    return at, walk
+    walk = eqx.tree_at(
+        lambda walk: (walk.counts, walk.overflowed),
+        _no_walk(volume, hierarchy),
+        (at.counts, too_many(at.counts.groups, plan)),
+    )
+
+    def with_sample_tests() -> Walk:
+        n_items = hierarchy.tile_of_item.shape[0]
+        length = at.lists.count[:n_items]
+        own_length = length[jnp.clip(hierarchy.item_of_sample, 0, n_items - 1)]
+        tests = jnp.where(hierarchy.samples.receives, own_length, 0)
+        sample_tests = jnp.sum(length.astype(jnp.int64) * hierarchy.n_in_tile)
+        return eqx.tree_at(
+            lambda walk: (walk.list_length, walk.tests, walk.sample_tests), walk, (length, tests, sample_tests)
+        )
+
+    return at, jax.lax.cond(hierarchy.counted, with_sample_tests, lambda: walk)
