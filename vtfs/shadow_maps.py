@@ -53,4 +53,4 @@ def shadow_maps(config: Configuration, inputs: FrameInputs) -> ShadowMaps | None
 def _stopped(shadowed: list[np.ndarray], left: list[np.ndarray]) -> np.ndarray:
     # Of no sample both: alpha casters are tested on what opaque ones leave lit.
     by_alpha = [1 - channels.mean(axis=-1, dtype=np.float64) for channels in left]
-    return np.sum([*shadowed, *by_alpha], axis=0, dtype=np.float64)
+    return np.asarray(np.sum([*shadowed, *by_alpha], axis=0, dtype=np.float64))

@@ -195,6 +195,9 @@ def test_without_geometry_or_lights_shadows_are_refused():
     casters = between(samples, lights, 0)
     with pytest.raises(InputError, match="--shadow-lights 31: with 2 directional lights must be from 0 to 30"):
         ShadowScene(casters, SUNS, 31)
+    crowd = DirectionalLights(np.ones((40, 3)), np.ones((40, 3)))
+    with pytest.raises(InputError, match=r"the scene has 40 directional lights, which all cast: .* at most 32"):
+        ShadowScene(casters, crowd, 1)
     with pytest.raises(InputError, match="no light casts shadows; give --shadow-lights 1 or more"):
         FrameShadows(ShadowScene(casters, NO_DIRECTIONAL, 0), samples, lights)
     with pytest.raises(InputError, match="directional light 1 `toward`"):
