@@ -65,16 +65,8 @@ def tune(
     **Returns:** the content of `result.json`.
     """
     started, compiles = time.perf_counter(), watch_compiles()
-    tell("tracing view samples and counting the frames of the path")
     casts = casts_shadows(options.techniques)
-    frames = choose_frames(setup, DEFAULT_SHADOWS if casts else DEFAULT_CONFIGURATION)
-    samples = tuple(setup.samples(f) for f in frames)
     shadow_scene = setup.shadow_scene if casts else None
-    workload = SceneWorkload(
-        ScenePath(setup.key, frames, samples, setup.lights, options.seed, shadow_scene),
-        compiles,
-        options.objective,
-    )
     n_samples = setup.cameras.viewport.width_px * setup.cameras.viewport.height_px
     cannot = {}
     if shadow_scene is not None and not options.space:
@@ -83,6 +75,14 @@ def tune(
     space = options.space or default_space([name for name in options.techniques if name not in cannot], n_samples)
     if shadow_scene is not None:
         one_blending(space.configurations(), shadow_scene)
+    tell("tracing view samples and counting the frames of the path")
+    frames = choose_frames(setup, DEFAULT_SHADOWS if casts else DEFAULT_CONFIGURATION)
+    samples = tuple(setup.samples(f) for f in frames)
+    workload = SceneWorkload(
+        ScenePath(setup.key, frames, samples, setup.lights, options.seed, shadow_scene),
+        compiles,
+        options.objective,
+    )
     tell("measuring")
     found = search(
         space,

@@ -126,6 +126,15 @@ def test_view_samples_of_ones_own_renderer(n_frames):
     assert set(result["scene"]["measured_frames"]) <= set(range(n_frames))
 
 
+@pytest.mark.parametrize("space", [None, "two.toml"])
+def test_shadows_that_cannot_be_compared_are_refused_before_anything_is_counted(space, monkeypatch):
+    monkeypatch.setattr("tuning.tune.choose_frames", None)
+    Path("two.toml").write_text("[parameters]\nblending = ['grey', 'coloured']\n")
+    scene = ("conservatory", "--triangles", "1000", "--size", "64x36", "--lights", "20")
+    own = ("--techniques", "z_pass") if space is None else ("--techniques", "ptsv", "--space", space)
+    is_refused(vtfs("tune", *scene, *own, "--out", "out"), "z_pass" if space is None else "`blending` = grey, coloured")
+
+
 def test_shadow_techniques_are_tuned_as_others_and_not_among_them():
     Path("one.toml").write_text("[parameters]\nbranching = [32]\n")
     ran = tune("--techniques", "cluster_hierarchy", "--shadow-lights", "2", "--budget", "2", space="one.toml")
