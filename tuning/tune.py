@@ -100,6 +100,8 @@ def tune(
     tell("drawing")
     drawn = draw(workload, found, options.out / "pictures")
     compared = [m for m in found.measurements if is_timed(m)]
+    # Settings that change the image are tried around the best one, and are none of the space.
+    tried = (configuration(m.technique, m.params) for m in found.measurements)
     result = {
         "schema": 1,
         "command": options.command,
@@ -120,7 +122,7 @@ def tune(
         "seed": options.seed,
         "objective": options.objective,
         "max_error": options.max_error,
-        "space_size": len(space.configurations()),
+        "space_size": len({*space.configurations(), *tried}),
         "measured": len(compared),
         "failed": len(found.measurements) - len(compared),
         "stop_reason": found.stop_reason,

@@ -99,6 +99,11 @@ def test_a_built_in_scene_with_the_default_space():
     assert "for this JAX implementation on this device" in ran.out
 
 
+def test_no_more_is_measured_than_the_space_is_said_to_have():
+    result = result_of(tune("--techniques", "tiled_deferred", "--budget", "20"))
+    assert 2 < result["measured"] <= result["space_size"]  # two in the space, and what changes the image
+
+
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply"])
 def test_files_of_ones_own(suffix):
     scene = build_scene("street", 1000)
