@@ -51,9 +51,11 @@ def covers(vertex_m, triangles, sample_m, fault: Fault):
         sample_m = tuple(c.astype(jnp.float32) for c in sample_m)
     elif fault == "sign":
         x, y, z = planes.normal[0]
-        planes = type(planes)(((-x, -y, -z), *planes.normal[1:]), (), planes.least, (), planes.behind)
+        planes = type(planes)(((-x, -y, -z), *planes.normal[1:]), (), planes.least, planes.face, planes.behind)
     elif fault == "no ties":
-        planes = type(planes)(planes.normal, (), tuple(0 * c - 1e-300 for c in planes.least), (), planes.behind)
+        planes = type(planes)(
+            planes.normal, (), tuple(0 * c - 1e-300 for c in planes.least), planes.face, planes.behind
+        )
 
     def one(total, k):
         plane = jax.tree.map(lambda c: c[k], planes)

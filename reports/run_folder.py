@@ -235,8 +235,9 @@ def _read(path: Path) -> bytes:
 
 
 def _read_result(path: Path) -> dict[str, Any]:
+    content = _read(path)
     try:
-        result = json.loads(_read(path))
+        result = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: damaged ({error}); run `vtfs tune` again.") from None
     if not isinstance(result, dict):

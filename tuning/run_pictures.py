@@ -117,14 +117,14 @@ def _log(counts: np.ndarray) -> np.ndarray:
 def _shadows(best: Configuration, maps: ShadowMaps, folder: Path) -> dict[str, Any]:
     """What share of the lights that cast and would light it each pixel is lit by."""
     lit = maps.lit > 0
-    share = 1 - maps.shadowed / np.maximum(maps.lit, 1)
+    share = 1 - maps.stopped / np.maximum(maps.lit, 1)
     write_png(folder / "shadows.png", heat_map(np.round(1000 * share).astype(np.int64), 1000, lit))
     return {
         "file": "shadows.png",
         "kind": "shadows",
         "technique": best.technique,
         "caption": "Dark in the shadow of all lights that cast and would light the pixel, bright in that of none: "
-        f"{maps.shadowed.sum() / max(int(maps.lit.sum()), 1):.1%} in shadow.",
+        f"{maps.share_stopped:.1%} in shadow.",
     }
 
 
@@ -142,8 +142,7 @@ def _cells(workload: SceneWorkload, fastest_first: list[Measurement], folder: Pa
             "slices": (heat_map(maps.depth_slice, deepest, solid), f"Depth slices, 0 (dark) to {deepest} (bright)."),
             "false_positives": (
                 heat_map(maps.false_positives, in_vain, solid),
-                f"Lights listed in vain, 0 (dark) to {in_vain} (bright) a pixel: {maps.listed_per_reaching:.2f} are "
-                "listed for one that reaches.",
+                f"Lights listed in vain, 0 (dark) to {in_vain} (bright) a pixel: {maps.listed_in_words}.",
             ),
         }
         if not deepest:

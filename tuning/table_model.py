@@ -98,9 +98,12 @@ class TableModel:
     def _model(self, key: tuple[str, ...]) -> TimeModel:
         if key in self.models:
             return self.models[key]
+        for i, (name, value) in enumerate(zip(self.label_names, key, strict=True)):
+            known = dict.fromkeys(other[i] for other in self.models)
+            if value not in known:
+                raise InputError(f"{name} `{value}`: the model was not fitted to it; it knows {', '.join(known)}.")
         wanted = ", ".join(f"{name} `{value}`" for name, value in zip(self.label_names, key, strict=True))
-        known = "; ".join(", ".join(other) for other in self.models)
-        raise InputError(f"{wanted}: the model was not fitted to it; it knows {known}.")
+        raise InputError(f"{wanted}: the model knows each of these, but was not fitted to them together.")
 
 
 def fit_table(table: TimingTable, seed: int = 0) -> TableModel:

@@ -65,16 +65,8 @@ def tune(
     **Returns:** the content of `result.json`.
     """
     started, compiles = time.perf_counter(), watch_compiles()
-    tell("tracing view samples and counting the frames of the path")
     casts = casts_shadows(options.techniques)
-    frames = choose_frames(setup, DEFAULT_SHADOWS if casts else DEFAULT_CONFIGURATION)
-    samples = tuple(setup.samples(f) for f in frames)
     shadow_scene = setup.shadow_scene if casts else None
-    workload = SceneWorkload(
-        ScenePath(setup.key, frames, samples, setup.lights, options.seed, shadow_scene),
-        compiles,
-        options.objective,
-    )
     n_samples = setup.cameras.viewport.width_px * setup.cameras.viewport.height_px
     cannot = {}
     if shadow_scene is not None and not options.space:
@@ -83,6 +75,14 @@ def tune(
     space = options.space or default_space([name for name in options.techniques if name not in cannot], n_samples)
     if shadow_scene is not None:
         one_blending(space.configurations(), shadow_scene)
+    tell("tracing view samples and counting the frames of the path")
+    frames = choose_frames(setup, DEFAULT_SHADOWS if casts else DEFAULT_CONFIGURATION)
+    samples = tuple(setup.samples(f) for f in frames)
+    workload = SceneWorkload(
+        ScenePath(setup.key, frames, samples, setup.lights, options.seed, shadow_scene),
+        compiles,
+        options.objective,
+    )
     tell("measuring")
     found = search(
         space,
@@ -100,6 +100,8 @@ def tune(
     tell("drawing")
     drawn = draw(workload, found, options.out / "pictures")
     compared = [m for m in found.measurements if is_timed(m)]
+    # Settings that change the image are tried around the best one, and are none of the space.
+    tried = (configuration(m.technique, m.params) for m in found.measurements)
     result = {
         "schema": 1,
         "command": options.command,
@@ -120,7 +122,7 @@ def tune(
         "seed": options.seed,
         "objective": options.objective,
         "max_error": options.max_error,
-        "space_size": len(space.configurations()),
+        "space_size": len({*space.configurations(), *tried}),
         "measured": len(compared),
         "failed": len(found.measurements) - len(compared),
         "stop_reason": found.stop_reason,

@@ -40,6 +40,13 @@ class CellMaps:
         reaching = int(self.reaching.sum(dtype=np.int64))
         return int(self.listed.sum(dtype=np.int64)) / reaching if reaching else float("nan")
 
+    @property
+    def listed_in_words(self) -> str:
+        """`listed_per_reaching`, for a caption."""
+        if not self.reaching.any():
+            return "no light reaches a sample"
+        return f"{self.listed_per_reaching:.2f} listed for one that reaches"
+
 
 def cell_maps(config: Configuration, inputs: FrameInputs) -> CellMaps | None:
     """The maps of a technique that shades by cells; None for the others."""

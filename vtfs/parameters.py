@@ -56,7 +56,8 @@ class Parameter:
         except (TypeError, ValueError, OverflowError):
             parsed = None
         if parsed is None or not self._holds(parsed):
-            raise InputError(f"parameter `{self.name}` = {value!r}: must be {self.allowed}.")
+            one_of = "one of " if self.choices and self.choices != _BATCHES else ""
+            raise InputError(f"parameter `{self.name}` = {value!r}: must be {one_of}{self.allowed}.")
         return parsed
 
     def _holds(self, value: Value) -> bool:

@@ -82,9 +82,22 @@ class SceneSetup:
 
         **Raises:** `InputError` where there is no such frame.
         """
+        self._check_frame(frame)
+        return self._source.samples(self.cameras, frame)
+
+    def chosen_frames(self, asked: Sequence[int] | None) -> tuple[int, ...]:
+        """The frames that were asked for, each once; without any all of them.
+
+        **Raises:** `InputError` where there is no such frame, before work is spent on the others.
+        """
+        frames = tuple(dict.fromkeys(asked or range(self.n_frames)))
+        for frame in frames:
+            self._check_frame(frame)
+        return frames
+
+    def _check_frame(self, frame: int) -> None:
         if not 0 <= frame < self.n_frames:
             raise InputError(f"frame {frame}: the camera path has frames 0 to {self.n_frames - 1}.")
-        return self._source.samples(self.cameras, frame)
 
     @property
     def scene(self) -> Scene | None:
@@ -227,9 +240,18 @@ def _scene(options: SceneOptions) -> Scene:
     name = options.scene or DEFAULT_SCENE
     if name in GALLERY:
         return build_scene(name, options.n_triangles, options.seed)
+    _refuse_triangles(options)
     if not Path(name).suffix and not Path(name).exists():
         raise InputError(f"scene `{name}`: neither a file nor a built-in scene; built in are {', '.join(GALLERY)}.")
     return load_scene(name)
+
+
+def _refuse_triangles(options: SceneOptions) -> None:
+    if options.n_triangles is not None:
+        raise InputError(
+            f"--triangles {options.n_triangles}: {options.scene} has its own; it goes with a built-in scene: "
+            f"{', '.join(GALLERY)}."
+        )
 
 
 def _given_lights(given: str | None) -> Lights | int | None:
@@ -261,6 +283,7 @@ def _own_sample_files(scene: str | None) -> tuple[Path, ...]:
 def _own_setup(
     options: SceneOptions, files: tuple[Path, ...], cameras: CameraPath | None, lights: Lights | int | None
 ) -> SceneSetup:
+    _refuse_triangles(options)
     missing = next((file for file in files if not file.is_file()), None)
     if missing:
         raise InputError(f"{missing}: no such file; give the path of a G-buffer as .npz.")

@@ -96,11 +96,14 @@ def alpha_frame(task: ShadowTask, shadowed: Bool[Array, "runs 32"]) -> ShadowFra
 def brightest_lights(samples: ViewSamples, lights: Lights, n: int) -> np.ndarray:
     """The `n` lights that light the visible samples most, brightest first; fewer where fewer light any.
 
-    Irradiance, mean over the colours, summed over at most 4,096 evenly spaced samples.
+    Irradiance, mean over the colours, summed over at most 4,096 evenly spaced samples: solid ones, or those of
+    transparent layers where there are no others.
     """
-    at = np.flatnonzero(samples.valid.ravel())
+    views = (samples, *(layer.samples for layer in samples.layers.transparent))
+    seen = next((view for view in views if view.valid.any()), samples)
+    at = np.flatnonzero(seen.valid.ravel())
     at = at[:: max(1, -(-len(at) // _RANKED_SAMPLES))]
-    position, normal = (c.reshape(-1, 3)[at].astype(np.float64) for c in (samples.position_m, samples.normal))
+    position, normal = (c.reshape(-1, 3)[at].astype(np.float64) for c in (seen.position_m, seen.normal))
     view = lights.relative_to(samples.camera.view_from_world)
     light_of_all = np.zeros(lights.n_lights)
     for light in np.flatnonzero(view.range_m > 0):
@@ -130,6 +133,9 @@ class FrameShadows:
         self.views = (samples, *(layer.samples for layer in samples.layers.transparent))
         suns = scene.suns
         chosen = brightest_lights(samples, lights, scene.n_lights)
+        if not len(chosen) and not suns.n_lights:
+            # A frame that no light lights is a dark frame of its path: one of them casts on no sample.
+            chosen = np.flatnonzero(lights.range_m > 0)[: min(scene.n_lights, 1)]
         self.slot = np.full(max(lights.n_lights, 1), -1, np.int32)  # no light at all is one without range
         self.slot[chosen] = suns.n_lights + np.arange(len(chosen))
         self.lights = (
@@ -138,7 +144,7 @@ class FrameShadows:
         )
         self.range_m = np.concatenate([np.full(suns.n_lights, np.inf), lights.range_m[chosen]])
         if not self.lights:
-            raise InputError("no light casts a shadow on this frame; give --shadow-lights 1 or more, or other lights.")
+            raise InputError("no light casts shadows; give --shadow-lights 1 or more, and lights that have a range.")
 
     @cached_property
     def slots(self) -> ShadowSlots:

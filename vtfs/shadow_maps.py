@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vtfs.frame import cast_counted
+from vtfs.frame import cast_counted, image_on_host
 from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
 from vtfs.parameters import SHADOW_REFERENCES, Configuration
@@ -15,15 +15,21 @@ from vtfs.techniques import REGISTRY
 
 @dataclass(frozen=True)
 class ShadowMaps:
-    """Of the visible solid samples, int `[h, w]`, summed over the lights that cast.
+    """Of the visible solid samples, `[h, w]`, summed over the lights that cast.
 
-    - `lit`: lights that would light each sample; `shadowed`: those of them that do not reach it at all.
+    - `lit`: lights that would light each sample; `stopped`: how much of them does not reach it: 1 of a light that it
+      lies in the shadow of, a share of one that comes through panes (mean of the colours).
     - `tests`: triangles that its tile or cluster is tested against; of references 0.
     """
 
     lit: np.ndarray
-    shadowed: np.ndarray
+    stopped: np.ndarray
     tests: np.ndarray
+
+    @property
+    def share_stopped(self) -> float:
+        """Of what all lights that cast would light."""
+        return float(self.stopped.sum()) / max(int(self.lit.sum()), 1)
 
 
 def shadow_maps(config: Configuration, inputs: FrameInputs) -> ShadowMaps | None:
@@ -34,13 +40,17 @@ def shadow_maps(config: Configuration, inputs: FrameInputs) -> ShadowMaps | None
     solid, n_slots = shadows.views[0], len(shadows.lights)
     lit = np.sum([shadows.lit_by(solid, k) for k in range(n_slots)], axis=0)
     if config.technique in SHADOW_REFERENCES:
-        masks = []
-        for mask in shadows.reference_masks(config)[:n_slots]:
-            stopped = np.all([np.asarray(c) == 0 for c in mask.transmittance], axis=0) if mask.transmittance else False
-            masks.append(from_runs(np.asarray(mask.shadowed) | stopped, inputs.viewport))
-        return ShadowMaps(lit, np.sum(masks, axis=0), np.zeros_like(lit))
+        masks = shadows.reference_masks(config)[:n_slots]
+        shadowed = [from_runs(np.asarray(mask.shadowed), inputs.viewport) for mask in masks]
+        left = [image_on_host(mask.transmittance, inputs) for mask in masks if mask.transmittance]
+        return ShadowMaps(lit, _stopped(shadowed, left), np.zeros_like(lit))
     cast = cast_counted(config, inputs)
     opaque, alpha = cast.opaque[:n_slots], cast.alpha[:n_slots]
+    stopped = _stopped([each.shadowed for each in opaque], cast.transmittance[:n_slots])
+    return ShadowMaps(lit, stopped, np.sum([each.tests for each in (*opaque, *alpha)], axis=0))
+
+
+def _stopped(shadowed: list[np.ndarray], left: list[np.ndarray]) -> np.ndarray:
     # Of no sample both: alpha casters are tested on what opaque ones leave lit.
-    shadowed = [each.shadowed for each in (*opaque, *alpha)]
-    return ShadowMaps(lit, np.sum(shadowed, axis=0), np.sum([each.tests for each in (*opaque, *alpha)], axis=0))
+    by_alpha = [1 - channels.mean(axis=-1, dtype=np.float64) for channels in left]
+    return np.asarray(np.sum([*shadowed, *by_alpha], axis=0, dtype=np.float64))

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from vtfs.view_samples import ViewSamples
 
 EDGE_BAND_RAD = 1e-5
+"""About edges, seen from the light; of a light further than the casters' extent 1e-5 of that extent, as of a
+directional one: from 1e5 extents away the whole scene lies within 1e-5 rad of an edge, and all would be excused."""
+
 PLANE_BAND_BIASES = 2.0
 _ON_PLANE_BIASES = 0.1
 """A sample this near to a plane lies on it: float32 positions are off by at most 0.02 biases of 1e-5 of the extent."""
@@ -163,7 +166,8 @@ class ShadowRays:
 class Mismatches:
     """Samples where a mask differs from a reference, by reason.
 
-    - `near_edge`: within 1e-5 rad of a caster's edge, seen from the light (directional: 1e-5 of the extent).
+    - `near_edge`: within 1e-5 rad of a caster's edge, seen from the light (of a directional one, or one further than
+      the extent: 1e-5 of the extent).
     - `near_plane`: not that, but within twice the bias of the plane of a caster that covers it and that it does not lie
       on: a surface that shadows itself is an error.
     - `errors`: neither; `error_points`: their indices.
@@ -195,7 +199,7 @@ def classify(
     near_edge, near_plane, errors = 0, 0, []
     for index in np.flatnonzero(differs):
         point = points_m[index]
-        if _edge_angle(point, corners, homogeneous, extent_m) <= EDGE_BAND_RAD:
+        if _edge_angle(point, corners, homogeneous, extent_m) <= _edge_band_rad(point, homogeneous, extent_m):
             near_edge += 1
         elif _plane_distance(point, corners, homogeneous, _ON_PLANE_BIASES * bias_m) <= PLANE_BAND_BIASES * bias_m:
             near_plane += 1
@@ -229,7 +233,8 @@ def is_excused(
     way = homogeneous[:3] - homogeneous[3] * points_m
     distance = np.linalg.norm(way, axis=1, keepdims=True)
     way = way / np.maximum(distance, 1e-300)
-    reach = EDGE_BAND_RAD * (np.full_like(distance, casters.extent_m) if light.directional else distance)
+    extents = np.full_like(distance, casters.extent_m)
+    reach = EDGE_BAND_RAD * (extents if light.directional else np.minimum(distance, extents))
     # Any axis that is not along the way.
     across = np.cross(way, np.eye(3)[np.abs(way).argmin(axis=1)])
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
@@ -246,29 +251,38 @@ def is_excused(
             by_edge |= is_right(points_m + step, bias_m)
     left = np.flatnonzero(shadowed & ~by_edge)
     if not light.directional:
-        by_edge[left] = _is_near_an_edge(-way[left], casters, origin + homogeneous[:3])
+        band_rad = (reach / np.maximum(distance, 1e-300))[left]
+        by_edge[left] = _is_near_an_edge(-way[left], casters, origin + homogeneous[:3], band_rad)
     by_plane = np.zeros(len(points_m), bool)
     for biases in (1 - PLANE_BAND_BIASES, 0.0, 1 + PLANE_BAND_BIASES):
         by_plane |= is_right(points_m, biases * bias_m)
     return by_edge, by_plane
 
 
-def _is_near_an_edge(way: np.ndarray, casters: Casters, light_m: np.ndarray) -> np.ndarray:
-    """Do unit directions from a light pass within 1e-5 rad of an edge, bool `[n]`? As `_edge_angle`, all at once."""
+def _edge_band_rad(point: np.ndarray, light: np.ndarray, extent_m: float) -> float:
+    if light[3] == 0:
+        return EDGE_BAND_RAD
+    return EDGE_BAND_RAD * min(1.0, extent_m / max(float(np.linalg.norm(light[:3] - point)), 1e-300))
+
+
+def _is_near_an_edge(way: np.ndarray, casters: Casters, light_m: np.ndarray, band_rad: np.ndarray) -> np.ndarray:
+    """Do unit directions from a light pass within bands `[n, 1]` of an edge, bool `[n]`? As `_edge_angle`, all at
+    once."""
     near = np.zeros(len(way), bool)
     corner = [casters.vertices_m[casters.triangles[:, k]] - light_m for k in range(3)]
     corner = [v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-300) for v in corner]
     n_ways = max(1, _PAIRS_AT_ONCE // max(1, casters.n_triangles))
     for first in range(0, len(way), n_ways):
         some, found = way[first : first + n_ways], np.zeros(min(n_ways, len(way) - first), bool)
+        band = band_rad[first : first + n_ways]
         for k in range(3):
             a, b = corner[k], corner[(k + 1) % 3]
-            found |= ((some @ a.T) >= np.cos(EDGE_BAND_RAD)).any(axis=1)
+            found |= ((some @ a.T) >= np.cos(band)).any(axis=1)
             normal = np.cross(a, b)
             size = np.linalg.norm(normal, axis=1)
             normal = normal / np.maximum(size, 1e-300)[:, None]
             abreast = (some @ np.cross(normal, a).T >= 0) & (some @ np.cross(b, normal).T >= 0) & (size > 1e-14)
-            found |= (abreast & (np.abs(some @ normal.T) <= EDGE_BAND_RAD)).any(axis=1)
+            found |= (abreast & (np.abs(some @ normal.T) <= band)).any(axis=1)
         near[first : first + n_ways] = found
     return near
 

@@ -44,6 +44,11 @@ class ShadowScene:
     seed: int = 0
 
     def __post_init__(self):
+        if self.suns.n_lights > MAX_SHADOW_LIGHTS:
+            raise InputError(
+                f"the scene has {self.suns.n_lights} directional lights, which all cast: there must be at most "
+                f"{MAX_SHADOW_LIGHTS}; remove some."
+            )
         if not 0 <= self.n_lights <= MAX_SHADOW_LIGHTS - self.suns.n_lights:
             raise InputError(
                 f"--shadow-lights {self.n_lights}: with {self.suns.n_lights} directional lights must be from 0 to "

@@ -93,6 +93,15 @@ def test_every_part_is_there(reader):
         assert said in reader.text
 
 
+def test_one_light_is_one_and_sentences_stand_apart(tmp_path):
+    files = complete_run()
+    files.result.update({"kind": "shadows", "max_error": 0.01})
+    files.result["scene"] |= {"lights": 1, "shadow_lights": 1}
+    text = Reader(page_of(files, tmp_path)).text
+    assert ", 1 light, 1 of them with shadows" in text and ", 1 lights" not in text
+    assert "are another job. Only images with an error up to" in text
+
+
 def test_nothing_is_asked_of_the_network(page, reader):
     addresses = [
         value for _, attributes in reader.elements for name, value in attributes.items() if name in ("src", "href")

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from tests.tuning.measurements import a_measurement
 from tuning.formats import bounded_text
 from tuning.formats.csv_table import CsvLayout, read_csv, read_features, read_layout, unit_of, write_csv
 from tuning.formats.extra_p import read_extra_p, write_extra_p
@@ -603,6 +604,15 @@ def test_our_own_record_is_a_row_for_each_stage_and_frame(folder):
     assert table.labels["stage"] == ("frame", "frame", "assign") and table.labels["gbuffer"] == ("float32",) * 3
     assert table.columns["frame"].tolist() == [3, 7, 3] and table.columns["samples"].tolist() == [10, 20, 10]
     assert table.columns["tile_px"].tolist() == [16, 16, 16] and table.compile_ms == (1500.0,) * 3
+
+
+def test_levels_that_a_tree_of_our_own_record_does_not_have_took_no_tests(folder):
+    path = folder / "levels.jsonl"
+    for technique, counts in (("ptsv", {"tests_0": 5, "tests_1": 7}), ("ptsv", {"tests_0": 6}), ("forward", {"n": 1})):
+        append_measurement(path, a_measurement(technique, counts=(counts,), stages_ms={"frame": ((1.0,),)}))
+    columns = read_measurements(path).columns
+    assert columns["tests_1"].tolist()[:2] == [7, 0] and columns["tests_0"].tolist()[:2] == [5, 6]
+    assert np.isnan(columns["tests_1"][2]) and np.isnan(columns["n"][:2]).all()  # another technique's
 
 
 def test_an_unknown_format_is_refused(folder):

@@ -119,7 +119,7 @@ def test_a_file_is_read_and_what_a_technique_lacks_is_ignored_for_it(space_file)
         ("[parameters]\ntile_px = [true]", "`tile_px` = True"),
         ("[parameters]\ntile_px = [16.5]", "`tile_px` = 16.5"),
         ("[parameters]\ntile_px = [[16]]", r"`tile_px` = \[16\]"),
-        ("[parameters]\nbranching = [3]", "`branching` = 3: must be 2, 4, 8"),
+        ("[parameters]\nbranching = [3]", "`branching` = 3: must be one of 2, 4, 8"),
         ("[parameters]\nbranch = [4]", "`parameters.branch`: unknown; choose from tile_px"),
         ("", "`\\[parameters\\]`: missing"),
         ("[parameters]", "`\\[parameters\\]`: missing or empty"),

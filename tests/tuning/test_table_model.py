@@ -174,6 +174,12 @@ def test_bad_tables_are_refused_by_name():
         model.predict({"x": x}, {})
     with pytest.raises(InputError, match="stage `shade`: the model was not fitted to it; it knows sort"):
         model.predict({"x": x[:1]}, {"stage": ("shade",)})
+    pairs = {"a": ("p", "q") * 5, "b": ("r", "s") * 5}
+    model = fit_table(table({"x": x}, 1 + x, **pairs))
+    with pytest.raises(InputError, match="b `t`: the model was not fitted to it; it knows r, s"):
+        model.predict({"x": x[:1]}, {"a": ("p",), "b": ("t",)})
+    with pytest.raises(InputError, match="a `p`, b `s`: the model knows each of these, but was not fitted to them tog"):
+        model.predict({"x": x[:1]}, {"a": ("p",), "b": ("s",)})
 
 
 class TestWhereFittingFails:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import tuning.timing
 from tuning.choose import median_interval
-from tuning.timing import MIN_REPEATS, MIN_S, PRECISION, interleaved_ms, repeats_ms, timed_ms
+from tuning.timing import KEPT_REPEATS, MIN_REPEATS, MIN_S, PRECISION, interleaved_ms, repeats_ms, timed_ms
 
 
 class FakeClock:
@@ -89,6 +89,15 @@ def test_repeats_stop_where_they_are_precise_or_cost_too_much_and_no_earlier(tim
 
     assert len(times) >= MIN_REPEATS and done(len(times))
     assert not any(done(n) for n in range(MIN_REPEATS, len(times)))
+
+
+def test_of_a_short_run_the_last_thousand_times_are_kept(monkeypatch):
+    times = np.arange(1, 5001) * 1e-4 / 3
+    kept = repeats_ms(FakeClock(monkeypatch, times).runs[0], never, cap_s=0.05)
+    assert len(kept) == KEPT_REPEATS
+    steps = np.diff(kept)
+    assert (steps > 0).sum() >= KEPT_REPEATS - 2  # in order, none left out
+    assert kept[-1] >= kept[0]
 
 
 def test_runs_in_turns_meet_the_same_drift(monkeypatch):

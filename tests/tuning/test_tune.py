@@ -99,6 +99,11 @@ def test_a_built_in_scene_with_the_default_space():
     assert "for this JAX implementation on this device" in ran.out
 
 
+def test_no_more_is_measured_than_the_space_is_said_to_have():
+    result = result_of(tune("--techniques", "tiled_deferred", "--budget", "20"))
+    assert 2 < result["measured"] <= result["space_size"]  # two in the space, and what changes the image
+
+
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply"])
 def test_files_of_ones_own(suffix):
     scene = build_scene("street", 1000)
@@ -124,6 +129,15 @@ def test_view_samples_of_ones_own_renderer(n_frames):
     is_complete(result)
     assert result["scene"]["frames"] == n_frames and result["scene"]["triangles"] == 0
     assert set(result["scene"]["measured_frames"]) <= set(range(n_frames))
+
+
+@pytest.mark.parametrize("space", [None, "two.toml"])
+def test_shadows_that_cannot_be_compared_are_refused_before_anything_is_counted(space, monkeypatch):
+    monkeypatch.setattr("tuning.tune.choose_frames", None)
+    Path("two.toml").write_text("[parameters]\nblending = ['grey', 'coloured']\n")
+    scene = ("conservatory", "--triangles", "1000", "--size", "64x36", "--lights", "20")
+    own = ("--techniques", "z_pass") if space is None else ("--techniques", "ptsv", "--space", space)
+    is_refused(vtfs("tune", *scene, *own, "--out", "out"), "z_pass" if space is None else "`blending` = grey, coloured")
 
 
 def test_shadow_techniques_are_tuned_as_others_and_not_among_them():

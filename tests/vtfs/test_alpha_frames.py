@@ -65,6 +65,15 @@ def test_a_half_transparent_pane_leaves_exactly_its_share_of_point_and_sun(techn
     assert np.abs(found / (lit * np.array(factor, np.float32)) - 1).max() < 4 * 2.0**-23
 
 
+@pytest.mark.parametrize("technique", ["ptsv", "brute_force"])
+def test_the_map_of_shadows_holds_what_panes_stop(technique):
+    for blending, stopped in (("grey", 0.5), ("coloured", 1 - (1 + 0.625 + 0.5) / 3)):
+        maps = shadow_maps(configuration(technique, {"blending": blending}), floor_under_glass())
+        assert maps is not None and (maps.lit == 2).all()
+        assert np.abs(maps.stopped - 2 * stopped).max() < 1e-6  # float32 transmittances
+        assert abs(maps.share_stopped - stopped) < 1e-6
+
+
 def test_stochastic_panes_let_each_sample_have_all_of_a_light_or_none():
     inputs = floor_under_glass()
     config = configuration("ptsv", {"blending": "stochastic"})
@@ -72,10 +81,10 @@ def test_stochastic_panes_let_each_sample_have_all_of_a_light_or_none():
     maps = shadow_maps(config, inputs)
     assert maps is not None and (maps.lit == 2).all()
     # 256 coins: six deviations around half of them.
-    assert abs(maps.shadowed.sum() - 128) < 6 * 8 and len(np.unique(maps.shadowed)) == 3
+    assert abs(maps.stopped.sum() - 128) < 6 * 8 and len(np.unique(maps.stopped)) == 3
     found, full = render(config, inputs), render(lit, inputs)
-    assert (found[maps.shadowed == 2] == 0).all()
-    whole = maps.shadowed == 0
+    assert (found[maps.stopped == 2] == 0).all()
+    whole = maps.stopped == 0
     assert np.abs(found[whole] / full[whole] - 1).max() < 4 * 2.0**-23  # another program, other fused sums
     assert np.array_equal(found, render(configuration("brute_force", {"blending": "stochastic"}), inputs))
 

@@ -180,13 +180,13 @@ def test_render_writes_an_image_and_a_heat_map(technique):
             )
 
 
-@pytest.mark.parametrize("technique", TUNED_TECHNIQUES)
+@pytest.mark.parametrize("technique", [*TUNED_TECHNIQUES, "shadow_rays"])
 def test_a_camera_that_sees_nothing(technique):
     away = CAMERA | {"frames": [{"eye": [1e3, 1, 0], "target": [2e3, 1, 0], "up": [0, 1, 0]}]}
     write("away.json", json.dumps(away))
     arguments = ("street", "--triangles", "1000", "--lights", "20", "--cameras", "away.json", "--technique", technique)
     ran = vtfs("render", *arguments)
-    assert ran.code == 0 and ran.err == "" and "at most 0" in ran.out
+    assert ran.code == 0 and ran.err == "" and "at most 0" in ran.out and "nan" not in ran.out
     counts = vtfs("count", *arguments, "--json", "-").json["frames"]
     assert len(counts) == 1 and counts[0]["samples"] == counts[0]["lighting_computations"] == 0
 
@@ -390,7 +390,10 @@ def test_a_light_file_that_is_wrong(content, words):
         (("--triangles", "5"), ("5", "1000")),
         (("--space", "none.toml"), ("none.toml",)),
         (("--out", "x.csv"), ("--out", "--space")),
-        (("--json", "file/x.json", "--frame", "0"), ("file/x.json", "cannot be written")),
+        (("--json", "file/x.json"), ("--json file/x.json", "cannot be written")),
+        (("--json", "."), ("--json .", "is a folder")),
+        (("--space", "space.toml", "--out", "."), ("--out .", "is a folder")),
+        (("--frame", "0", "--frame", "60"), ("frame 60", "0 to 59")),
     ],
     ids=lambda value: " ".join(value)[:40],
 )
@@ -450,7 +453,19 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_done(comm
 def test_a_report_of_what_is_no_run(folder):
     write("file", "")
     Path("empty").mkdir()
-    is_refused(vtfs("report", folder), folder)
+    ran = vtfs("report", folder)
+    is_refused(ran, f"vtfs: {folder}/result.json: missing" if folder == "empty" else f"vtfs: {folder}: no such folder")
+    assert "damaged" not in ran.err
+
+
+@pytest.mark.parametrize("arguments", [("count", "--json", "."), ("predict", "model.json", "rows.csv", "--out", ".")])
+def test_a_file_that_cannot_be_written_is_refused_before_anything_is_done(arguments, monkeypatch):
+    monkeypatch.setattr("vtfs.scene_setup.set_up", None)
+    is_refused(vtfs(*arguments), f"{arguments[-2]} .", "is a folder")
+
+
+def test_pictures_of_one_frame_are_not_drawn_where_the_next_is_none():
+    is_refused(vtfs("render", *SMALL, "--frame", "0", "--frame", "60"), "frame 60", "0 to 59")
 
 
 def test_a_bad_scene_leaves_nothing_behind():

@@ -59,6 +59,19 @@ def test_a_frame_that_is_not_there_is_refused(frame):
         set_up(SMALL).samples(frame)
 
 
+def test_frames_are_asked_for_once_each_and_all_by_default():
+    setup = with_frames(4)
+    assert setup.chosen_frames(None) == (0, 1, 2, 3) and setup.chosen_frames([2, 0, 2]) == (2, 0)
+    with pytest.raises(InputError, match="frame 4: the camera path has frames 0 to 3"):
+        setup.chosen_frames([0, 4])
+
+
+def test_a_size_in_triangles_is_of_a_built_in_scene(tmp_path):
+    save_scene(build_scene("street", 1000), tmp_path / "s.glb")
+    with pytest.raises(InputError, match=r"--triangles 2000: .*s\.glb has its own; .*: atrium, street"):
+        set_up(SceneOptions(str(tmp_path / "s.glb"), n_triangles=2000))
+
+
 def test_lights_reach_a_visible_sample_as_often_as_is_asked():
     """In the median over the visible samples of the counted frames, which are not the ones the range was found from:
     512 a frame are known to a few percent."""

@@ -29,7 +29,15 @@ from vtfs.shadow_mask import (
     shadow_frame,
     uncounted,
 )
-from vtfs.shadow_references import ShadowRays, brute_force, classify, facing_light, kept_casters, view_points_m
+from vtfs.shadow_references import (
+    ShadowRays,
+    brute_force,
+    classify,
+    facing_light,
+    is_excused,
+    kept_casters,
+    view_points_m,
+)
 from vtfs.shadow_techniques import cast_shadows, fitted, on_host, run_program, shadow_grid, shadow_program
 from vtfs.shadow_volumes.full_tree import n_cells, require_room
 from vtfs.shadow_volumes.volumes import volumes
@@ -474,6 +482,18 @@ def test_a_mask_that_is_wrong_everywhere_is_excused_nowhere():
     found = classify(points, np.ones(len(points), bool), casters, light, bias_m, eye)
     assert found.near_plane == 0
     assert found.errors > 0.98 * len(points)
+
+
+def test_a_light_far_away_excuses_no_more_than_one_that_is_near():
+    """From 1e6 extents away a scene is 1e-6 rad wide: were bands angles alone, every answer would be excused."""
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
+    casters = Casters(corners, np.array([[0, 1, 2]]))
+    light = ShadowLight((0.0, 0.0, 1e6 * casters.extent_m))
+    points, own = np.array([[0.0, -0.2, -1.0], [0.0, -0.999999, -1.0]]), np.full(2, -1)
+    found = classify(points, np.ones(2, bool), casters, light, bias_m=1e-4)
+    assert (found.near_edge, found.errors) == (1, 1)
+    by_edge, by_plane = is_excused(points, np.zeros(2, bool), casters, light, 1e-4, own)  # both lie in shadow
+    assert by_edge.tolist() == [False, True] and not by_plane.any()
 
 
 def test_mismatches_are_told_apart():

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.closed_sphere import KINDS, PLACES, covers, leaks_and_doubles
+from benchmarks.closed_sphere import KINDS, PLACES, covers, leaks_and_doubles, sphere
 from vtfs.shadow_casters import Casters
 from vtfs.shadow_mask import casters_on_device
 from vtfs.shadow_volumes.planes import edge_planes, inside
@@ -96,3 +96,23 @@ def _covers_from_afar(vertex, triangles, sample, way):
 def test_an_edge_is_watertight_where_each_triangle_has_vertices_of_its_own():
     assert leaks_and_doubles_below_a_sheet(weld=True) == (0, 0)
     assert min(leaks_and_doubles_below_a_sheet(weld=False)) > 100  # told apart by their numbers, both are there
+
+
+@pytest.mark.parametrize("distance", [3.0, 1e2, 1e4, 1e6])
+def test_however_far_the_light_a_surface_shadows_what_is_behind_it_and_not_itself(distance):
+    """A sphere of radius 1 before a light outside: a bias of 1e-5 before the face of each of its triangles and behind
+    it. A light 1e4 radii away once had rounding of more than that, and all in shadow."""
+    vertices, triangles, _ = sphere()
+    light = distance * np.array([2.0, 6.0, 3.0]) / 7
+    corner = vertices[triangles]
+    centre, normal = corner.mean(axis=1), np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    way = light - centre
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    facing = (normal * way).sum(axis=1) > 0.2 * np.linalg.norm(normal, axis=1)
+    centre, way = centre[facing], way[facing]
+    with jax.enable_x64(True):
+        vertex = tuple(jnp.asarray((vertices - light)[:, c]) for c in range(3))
+        for step, expected in ((1e-5, 0), (-1e-5, 1)):
+            sample = centre + step * way - light
+            total, _ = covers(vertex, triangles, tuple(jnp.asarray(sample[:, c]) for c in range(3)), "")
+            assert len(sample) > 50 and (np.asarray(total) == expected).all()

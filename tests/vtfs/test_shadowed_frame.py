@@ -1,6 +1,6 @@
 """Shadowed images: each light that casts, directional ones too, on solid samples and transparent layers."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -101,7 +101,7 @@ def test_a_technique_makes_the_image_that_the_references_make():
     image, expected = (render(c, inputs).astype(np.float64) for c in (CAST, configuration("brute_force")))
     maps = shadow_maps(CAST, inputs)
     assert maps is not None
-    assert 0.05 < maps.shadowed.sum() / maps.lit.sum() < 0.95
+    assert 0.05 < maps.share_stopped < 0.95
     # Pixels in which rounding decides one of three masks: a few of 561.
     off = np.abs(image - expected).max(axis=-1) > 1e-4 * expected.mean()
     assert off.sum() <= 0.01 * off.size
@@ -181,6 +181,34 @@ def test_the_lights_that_cast_are_those_that_light_the_view_most():
     assert set(order) == {i for i, light in enumerate(white) if light > 0}
 
 
+@pytest.mark.parametrize("technique", ["cluster_hierarchy", "z_pass", "brute_force"])
+def test_a_frame_that_no_light_lights_is_dark_not_an_error(technique):
+    samples = surface_samples(a_camera(), 1)
+    lights = nearby_lights(samples, 3, 1)
+    casters = between(samples, lights, 0)
+    config = configuration(technique)
+    short = replace(lights, range_m=np.full(3, 1e-6))
+    blind = replace(samples, valid=np.zeros_like(samples.valid))
+    for seen, own in ((samples, short), (blind, lights)):
+        inputs = FrameInputs(seen, own, shadow_scene=ShadowScene(casters, NO_DIRECTIONAL, 2))
+        assert len(inputs.shadows.lights) == 1
+        emitted = render(configuration("forward"), inputs)  # all there is: the samples' own light
+        assert largest_relative_difference(render(config, inputs), emitted, inputs.seen()) < 1e-6
+        counts = count(config, inputs)[0].of(config)
+        assert counts["shadow_lights"] == 1 and counts.get("test_and_set", 0) == 0
+        maps = shadow_maps(config, inputs)
+        assert maps is not None and maps.share_stopped == 0
+
+
+def test_where_all_is_transparent_the_lights_of_the_nearest_layer_cast():
+    samples = layered_samples(a_camera(), 5)
+    lights = nearby_lights(samples, 37, 5)
+    nearest = samples.layers.transparent[0].samples
+    only_layers = replace(samples, valid=np.zeros_like(samples.valid))
+    expected = brightest_lights(nearest, lights, 4)
+    assert len(expected) == 4 and list(brightest_lights(only_layers, lights, 4)) == list(expected)
+
+
 def test_without_geometry_or_lights_shadows_are_refused():
     samples = surface_samples(a_camera(), 1)
     lights = nearby_lights(samples, 3, 1)
@@ -189,7 +217,10 @@ def test_without_geometry_or_lights_shadows_are_refused():
     casters = between(samples, lights, 0)
     with pytest.raises(InputError, match="--shadow-lights 31: with 2 directional lights must be from 0 to 30"):
         ShadowScene(casters, SUNS, 31)
-    with pytest.raises(InputError, match="no light casts a shadow"):
+    crowd = DirectionalLights(np.ones((40, 3)), np.ones((40, 3)))
+    with pytest.raises(InputError, match=r"the scene has 40 directional lights, which all cast: .* at most 32"):
+        ShadowScene(casters, crowd, 1)
+    with pytest.raises(InputError, match="no light casts shadows; give --shadow-lights 1 or more"):
         FrameShadows(ShadowScene(casters, NO_DIRECTIONAL, 0), samples, lights)
     with pytest.raises(InputError, match="directional light 1 `toward`"):
         DirectionalLights(np.array([[1.0, 0, 0], [0, 0, 0]]), np.ones((2, 3)))

@@ -21,7 +21,13 @@ def read_measurements(path: Path | str) -> TimingTable:
     repeats_ms: list[tuple[float, ...]] = []
     compile_ms: list[float] = []
     n_untimed = 0
-    for measurement in read_record(path):
+    measurements = read_record(path)
+    # What one configuration of a technique counts and another does not is of a level that its tree does not have: 0.
+    counted: dict[str, dict[str, float]] = {}
+    for measurement in measurements:
+        for counts in measurement.counts:
+            counted.setdefault(measurement.technique, {}).update(dict.fromkeys(counts, 0.0))
+    for measurement in measurements:
         if measurement.outcome != "timed":
             n_untimed += 1
             continue
@@ -37,7 +43,7 @@ def read_measurements(path: Path | str) -> TimingTable:
             for frame, counts, repeats in zip(measurement.frames, measurement.counts, frames, strict=False):
                 finite = tuple(ms for ms in repeats if math.isfinite(ms))
                 if finite:
-                    own = {name: float(count) for name, count in counts.items()}
+                    own = counted[measurement.technique] | {name: float(count) for name, count in counts.items()}
                     records.append({**labels, "stage": stage, **params, "frame": float(frame), **own})
                     repeats_ms.append(finite)
                     compile_ms.append(1e3 * measurement.compile_s if math.isfinite(measurement.compile_s) else 0.0)

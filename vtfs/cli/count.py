@@ -11,7 +11,7 @@ from vtfs.cli.options import (
     JsonOption,
     SetOption,
     VerboseOption,
-    check_folder,
+    check_file,
     parsed_configuration,
     set_log_level,
     write_json,
@@ -50,14 +50,14 @@ def count(
             "--out goes with --space: it is the table of a space's counts; use --json for one configuration."
         )
     if out:
-        check_folder(out.parent, resume=True)
+        check_file("--out", out)
     configs = (config,)
     if space:
         from tuning.space import load_space
 
         configs = load_space(space, names).configurations()
     setup = scene.set_up()
-    frames = tuple(dict.fromkeys(frame)) if frame else tuple(range(setup.n_frames))
+    frames = setup.chosen_frames(frame)
     from vtfs.count_table import count_frames, counts_csv, print_counts
     from vtfs.device import keep_compiled_programs
 

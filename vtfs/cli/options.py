@@ -17,8 +17,17 @@ SetOption = Annotated[
     list[str] | None, typer.Option("--set", help="A parameter, as tile_px=16. Repeatable.", metavar="NAME=VALUE")
 ]
 TechniqueOption = Annotated[str, typer.Option(help=f"One of {', '.join(TECHNIQUES)}.")]
+
+
+def _checked_json(target: str | None) -> str | None:
+    if target is not None and target != "-":
+        check_file("--json", Path(target))
+    return target
+
+
 JsonOption = Annotated[
-    str | None, typer.Option("--json", help="Write the result here as JSON; - is stdout.", metavar="FILE")
+    str | None,
+    typer.Option("--json", help="Write the result here as JSON; - is stdout.", metavar="FILE", callback=_checked_json),
 ]
 VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Say more of what is done, on stderr.")]
 
@@ -33,8 +42,23 @@ def parsed_configuration(technique: str, settings: list[str] | None) -> Configur
     return configuration(technique, params)
 
 
+def check_file(option: str, file: Path) -> None:
+    """Can it be written? Asked before the work is done, not after it."""
+    if file.is_dir():
+        raise InputError(f"{option} {file}: is a folder; give the file to write.")
+    _probe(file.parent, f"{option} {file}: its folder cannot be written")
+
+
 def check_folder(folder: Path, resume: bool) -> None:
     """Can it be written, and does it not hold somebody's measurements?"""
+    _probe(folder, f"--out {folder}: is no folder that can be written")
+    if not resume and (folder / "measurements.jsonl").exists():
+        raise InputError(
+            f"{folder}: holds the measurements of an earlier run; go on with --resume, or name another --out."
+        )
+
+
+def _probe(folder: Path, otherwise: str) -> None:
     from vtfs.files import write_atomically
 
     probe = folder / ".vtfs-writable"
@@ -42,12 +66,8 @@ def check_folder(folder: Path, resume: bool) -> None:
         write_atomically(probe, b"")
     except InputError as error:
         reason = getattr(error.__cause__, "strerror", error)
-        raise InputError(f"--out {folder}: is no folder that can be written ({reason}); choose another one.") from error
+        raise InputError(f"{otherwise} ({reason}); choose another one.") from error
     probe.unlink()
-    if not resume and (folder / "measurements.jsonl").exists():
-        raise InputError(
-            f"{folder}: holds the measurements of an earlier run; go on with --resume, or name another --out."
-        )
 
 
 def write_json(target: str | None, value: object) -> None:

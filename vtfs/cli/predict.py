@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vtfs.cli.options import JsonOption, VerboseOption, set_log_level, write_json
+from vtfs.cli.options import JsonOption, VerboseOption, check_file, set_log_level, write_json
 from vtfs.cli.timing_data import FormatOption, IgnoreOption, MapOption, TimeOption, parsed_layout
 
 
@@ -29,6 +29,8 @@ def predict(
 ) -> None:
     """Predict times, with 90 % intervals, in the order of the rows."""
     set_log_level(verbose)
+    if out is not None:
+        check_file("--out", out)
     layout = parsed_layout(time, None, map_file, ignore)
     from tuning.formats.bounded_text import read_json
     from tuning.formats.csv_table import read_features

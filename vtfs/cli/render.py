@@ -40,6 +40,7 @@ def render(
     config = parsed_configuration(technique, settings)
     check_folder(out, resume=True)
     setup = scene.set_up()
+    frames = setup.chosen_frames(frame or [0])
     from vtfs.cell_maps import cell_maps
     from vtfs.device import keep_compiled_programs
     from vtfs.frame import render as render_frame
@@ -49,7 +50,7 @@ def render(
 
     keep_compiled_programs()
     written: list[dict[str, Any]] = []
-    for number in dict.fromkeys(frame or [0]):
+    for number in frames:
         with Status() as status:
             status.say(f"frame {number}")
             inputs = setup.inputs(number)
@@ -74,17 +75,14 @@ def render(
                 "slices": (heat_map(maps.depth_slice, deepest, solid), f"depth slices, 0 to {deepest}"),
                 "false_positives": (
                     heat_map(maps.false_positives, in_vain, solid),
-                    f"lights listed in vain: at most {in_vain}; "
-                    f"{maps.listed_per_reaching:.2f} listed for one that reaches",
+                    f"lights listed in vain: at most {in_vain}; {maps.listed_in_words}",
                 ),
             }
         if shadows is not None:
             most = int(shadows.tests.max(initial=0))
-            n_lit = int(shadows.lit.sum())
             pictures["shadow_mask"] = (
-                heat_map(shadows.shadowed, len(inputs.shadows.lights), solid),
-                f"lights that each pixel lies in the shadow of: {shadows.shadowed.sum() / max(n_lit, 1):.1%} of what "
-                "they would light",
+                heat_map(shadows.stopped, len(inputs.shadows.lights), solid),
+                f"lights that shadows keep from each pixel: {shadows.share_stopped:.1%} of what they would light",
             )
             if most:
                 mean = float(shadows.tests[solid].mean()) if solid.any() else 0.0

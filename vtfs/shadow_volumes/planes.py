@@ -62,16 +62,15 @@ class EdgePlanes(eqx.Module):
     - `least`: a sample is inside of a plane where its product is above this: 0, or just below it where the tie-break
       says
       that a sample in the plane is inside.
-    - `face`: normal of the triangle's plane, pointing away from a directional light; empty for a point light, where
-      the sum
-      of the three dot products stands for it.
+    - `face`: normal of the triangle's plane, pointing away from the light. The sum of the other three says the same of
+      a point light, but far from it carries the square of its distance as rounding.
     - `behind`: a sample is behind the plane where the face's product is above this.
     """
 
     normal: tuple[Vector, ...]
     offset: tuple[Float[Array, " n"], ...]
     least: tuple[Float[Array, " n"], ...]
-    face: tuple[Float[Array, " n"], ...]
+    face: Vector
     behind: Float[Array, " n"]
 
 
@@ -147,7 +146,7 @@ def edge_planes(
         first, second = (k + 1) % 3, (k + 2) % 3
         in_order = index[first] < index[second]
         low, high = _pick(in_order, corner[first], corner[second]), _pick(in_order, corner[second], corner[first])
-        normal = cross(light_m, minus(low, high)) if directional else cross(low, high)
+        normal = cross(light_m, minus(low, high)) if directional else _through_light(low, high)
         sign = jnp.where(in_order, 1.0, -1.0)
         normals.append(times(normal, sign))
         offsets.append(dot(normal, low) * sign if directional else None)
@@ -172,10 +171,17 @@ def edge_planes(
         tuple(tuple(map(last, normal)) for normal in normals),
         tuple(last(offset * inward) for offset in offsets) if directional else (),
         tuple(last(value) for value in least),
-        tuple(last(c) for c in times(face, inward)) if directional else (),
+        tuple(last(c) for c in times(face, inward)),
         last((dot(face, corner[0]) + bias_m * volume if directional else volume) * inward, jnp.inf),
     )
     return planes, inward
+
+
+def _through_light(low: Vector, high: Vector) -> Vector:
+    """`low x high`. Of a light far from an edge the vertices are nearly parallel: their product would carry the
+    square of the distance as rounding, one with the edge itself the distance alone."""
+    edge = minus(high, low)
+    return cross(low, _pick(dot(edge, edge) < dot(high, high), edge, high))
 
 
 def in_precision(planes: EdgePlanes, precision: Precision) -> EdgePlanes:
@@ -194,18 +200,15 @@ def inside(planes: EdgePlanes, sample: Vector, moved: Float[Array, "*n"]) -> Boo
     - `sample`: float64, relative to the light. NaN lies in no volume.
     - `moved`: bias over the distance to a point light; a directional light's is part of the planes.
     """
-    distances, holds = [], jnp.bool_(True)
+    holds = jnp.bool_(True)
     for k, normal in enumerate(planes.normal):
         distance = dot(normal, sample)
         if planes.offset:
             distance = distance - planes.offset[k]
-        within = distance > planes.least[k]
-        distances.append(distance)
-        holds = holds & within
-    if planes.face:
-        return holds & (dot(planes.face, sample) > planes.behind)
+        holds = holds & (distance > planes.least[k])
     # A sample moved along its line to the light stays on its side of the edges.
-    return holds & ((distances[0] + distances[1] + distances[2]) * (1 - moved) > planes.behind)
+    behind = dot(planes.face, sample)
+    return holds & ((behind if planes.offset else behind * (1 - moved)) > planes.behind)
 
 
 def node_planes(
