@@ -62,7 +62,7 @@ def covers(vertex_m, triangles, sample_m, fault: Fault):
         return total + inside(plane, sample_m, jnp.float64(0)).astype(jnp.int32), None
 
     total, _ = jax.lax.scan(one, jnp.zeros(sample_m[0].shape, jnp.int32), jnp.arange(triangles.shape[0]))
-    return total, inward != 0
+    return total, inward[:-1] != 0
 
 
 def leaks_and_doubles(kind: str, offset: float, scale: float, fault: Fault = "") -> tuple[int, int]:

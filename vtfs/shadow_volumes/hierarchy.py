@@ -107,11 +107,13 @@ def node_table(items: Aabb, branching: int, is_frustum: bool) -> NodeTable:
     high = [in_leaf_nodes(c, branching, -jnp.inf) for c in (items.high_x_m, items.high_y_m, items.high_z_m)]
     rows = jnp.concatenate([tree.children.astype(jnp.float32), jnp.stack([*low, *high], axis=1)])
     levels = (*inner_level_nodes(n_items, branching), n_leaf_nodes(n_items, branching))
-    return NodeTable(*_padded(rows, levels, is_frustum), levels)
+    row, n_children = _padded(rows, is_frustum)
+    is_of = np.repeat(np.arange(len(levels)), levels) == np.arange(len(levels))[:, None]
+    return NodeTable(row, n_children, jnp.sum(jnp.where(is_of, n_children, 0), axis=1, dtype=jnp.int32), levels)
 
 
-def _padded(rows: Float[Array, "nodes 6 branching"], levels: tuple[int, ...], is_frustum: bool) -> tuple[Array, ...]:
-    """`row`, `n_children` and `n_below` of a `NodeTable`."""
+def _padded(rows: Float[Array, "nodes 6 branching"], is_frustum: bool) -> tuple[Array, Array]:
+    """`row` and `n_children` of a `NodeTable`."""
     low, high = rows[:, :3], rows[:, 3:]
     exists = low[:, 2] <= high[:, 2]
     centre = low + (high - low) * 0.5
@@ -120,10 +122,7 @@ def _padded(rows: Float[Array, "nodes 6 branching"], levels: tuple[int, ...], is
         depths = low[:, 2] * (1 - PAD), high[:, 2] * (1 + PAD)
         centre, half = centre.at[:, 2].set(depths[0]), half.at[:, 2].set(depths[1])
     row = jnp.where(exists[:, None], jnp.concatenate([centre, half], axis=1), jnp.nan)
-    n_children = jnp.sum(exists, axis=1, dtype=jnp.int32)
-    ends = np.cumsum(levels)
-    n_below = [jnp.sum(n_children[end - nodes : end], dtype=jnp.int32) for nodes, end in zip(levels, ends, strict=True)]
-    return row, n_children, jnp.stack(n_below)
+    return row, jnp.sum(exists, axis=1, dtype=jnp.int32)
 
 
 def compact_table(
@@ -148,16 +147,18 @@ def compact_table(
     child, slot = [*leaf.child, *inner.child], [*leaf.slot, *inner.slot]
     lows, highs = (items.low_x_m, items.low_y_m, items.low_z_m), (items.high_x_m, items.high_y_m, items.high_z_m)
     # The greatest is minus the least of what is negated: all six at once.
-    bounds = jnp.stack([*lows, *(-high for high in highs)])
+    bounds = jnp.stack([*lows, *(-high for high in highs)], axis=1)
     rows: list[Array] = []
     for of_node in child:
-        row = jnp.where(of_node >= 0, bounds[:, jnp.maximum(of_node, 0)], jnp.inf).reshape(6, -1, branching)
-        rows.insert(0, jnp.concatenate([row[:3], -row[3:]]).transpose(1, 0, 2))
-        bounds = jnp.min(row, axis=2)
-    padded = _padded(jnp.concatenate(rows).astype(jnp.float32), levels, is_frustum=False)
+        row = jnp.where(of_node[:, None] >= 0, bounds[jnp.maximum(of_node, 0)], jnp.inf).reshape(-1, branching, 6)
+        rows.insert(0, row.transpose(0, 2, 1))
+        bounds = jnp.min(row, axis=1)
+    rows = jnp.concatenate(rows).astype(jnp.float32)
+    row, n_children = _padded(jnp.concatenate([rows[:, :3], -rows[:, 3:]], axis=1), is_frustum=False)
+    n_below = jnp.concatenate([inner.n[-2::-1], leaf.n[:1]])
     by_node = jnp.concatenate([of_node.reshape(-1, branching) for of_node in reversed(child)])
     most = jnp.maximum(jnp.max(leaf.n[1:]), jnp.max(inner.n[1:], initial=0))
-    return NodeTable(*padded, levels, by_node, jnp.concatenate(slot[::-1])), most
+    return NodeTable(row, n_children, n_below, levels, by_node, jnp.concatenate(slot[::-1])), most
 
 
 class _Parents(eqx.Module):

@@ -106,6 +106,11 @@ def corners(vertex_m: Vector, triangles: Int[Array, "n 3"]) -> tuple[Vector, Vec
     return tuple(tuple(gathered[c, :, k] for c in range(3)) for k in range(3))  # type: ignore[return-value]
 
 
+def with_none(triangles: Int[Array, "n 3"]) -> Int[Array, "n_and_1 3"]:
+    """And one more, without area."""
+    return jnp.concatenate([triangles, jnp.zeros((1, 3), triangles.dtype)])
+
+
 def times(a: Vector, s: Float[Array, "*n"]) -> Vector:
     return a[0] * s, a[1] * s, a[2] * s
 
@@ -125,7 +130,7 @@ def edge_planes(
     directional: bool,
     bias_m: Float[Array, ""],
     culls_front: Bool[Array, ""],
-) -> tuple[EdgePlanes, Float[Array, " n"]]:
+) -> tuple[EdgePlanes, Float[Array, " n_and_1"]]:
     """Exact planes of all volumes.
 
     **Arguments:**
@@ -135,10 +140,12 @@ def edge_planes(
       unit direction, else unused.
     - `culls_front`: leave out triangles that face the light.
 
-    **Returns:** the planes, and the orientation of each triangle: -1 where its front (counter-clockwise) faces the
-    light, 1
-    where it turns away, 0 where it has no volume: edge-on, without area, or of uncertain orientation.
+    **Returns:** the planes, and the orientation of each triangle and of none at the end: -1 where its front
+    (counter-clockwise) faces the light, 1 where it turns away, 0 where it has no volume: edge-on, without area, or of
+    uncertain orientation.
     """
+    # One without area at the end: everything comes out with an entry that holds nothing, and is copied for none.
+    triangles = with_none(triangles)
     corner = corners(vertex_m, triangles)
     index = tuple(triangles[:, k] for k in range(3))
     normals, offsets = [], []
@@ -162,17 +169,15 @@ def edge_planes(
     safe = safe & ~(culls_front & (volume < 0))
     inward = jnp.where(safe, jnp.where(volume > 0, 1.0, -1.0), 0.0)
 
-    def last(values, absent: float = 0.0):
-        return jnp.concatenate([values, jnp.full(1, absent, values.dtype)])
-
     normals = [times(normal, inward) for normal in normals]
     least = [jnp.where(first_is_positive(normal), BELOW_ZERO, 0.0) for normal in normals]
+    behind = (dot(face, corner[0]) + bias_m * volume if directional else volume) * inward
     planes = EdgePlanes(
-        tuple(tuple(map(last, normal)) for normal in normals),
-        tuple(last(offset * inward) for offset in offsets) if directional else (),
-        tuple(last(value) for value in least),
-        tuple(last(c) for c in times(face, inward)),
-        last((dot(face, corner[0]) + bias_m * volume if directional else volume) * inward, jnp.inf),
+        tuple(normals),
+        tuple(offset * inward for offset in offsets) if directional else (),
+        tuple(least),
+        times(face, inward),
+        jnp.where(safe, behind, jnp.inf),
     )
     return planes, inward
 
@@ -213,7 +218,7 @@ def inside(planes: EdgePlanes, sample: Vector, moved: Float[Array, "*n"]) -> Boo
 
 def node_planes(
     planes: EdgePlanes,
-    inward: Float[Array, " n"],
+    inward: Float[Array, " n_and_1"],
     vertex_m: Vector,
     triangles: Int[Array, "n 3"],
     light_m: Vector,
@@ -230,7 +235,7 @@ def node_planes(
     """
 
     units = [unit(normal) for normal in planes.normal]
-    corner = corners(vertex_m, jnp.concatenate([triangles, jnp.zeros((1, 3), triangles.dtype)]))
+    corner = corners(vertex_m, with_none(triangles))
     face = unit(cross(minus(corner[1], corner[0]), minus(corner[2], corner[0])))
     away = -dot(face, light_m) if directional else dot(face, corner[0])
     face = times(face, jnp.where(away < 0, -1.0, 1.0))
@@ -255,9 +260,8 @@ def node_planes(
             more = [dot(normal, light_m) for normal in extras] if extra == "vertex" else None
         more = [jnp.zeros_like(scale) for _ in extras] if more is None else more
         offsets = [*sides, *offsets, *more]
-    keeps = jnp.concatenate([inward != 0, jnp.zeros(1, bool)])
     at = 0 if about_light else 3
-    offsets[at] = jnp.where(keeps, offsets[at], jnp.inf)
+    offsets[at] = jnp.where(inward != 0, offsets[at], jnp.inf)
 
     def narrow(v: Vector) -> Vector:
         return tuple(c.astype(jnp.float32) for c in v)  # type: ignore[return-value]

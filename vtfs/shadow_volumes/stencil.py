@@ -127,6 +127,7 @@ def shadow_planes(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> Ste
     light, apex, zero = light_m(frame), origin_m(frame), jnp.float64(0)
     about_light = tuple(c - o for c, o in zip(vertex, apex, strict=True))
     planes, inward = edge_planes(about_light, frame.triangles, light, frame.directional, zero, frame.culls_front)
+    inward = inward[:-1]
     polygons = _polygons(frame, vertex, light, apex, inward, by_failing)
     around_eye = jnp.sum(inside(planes, tuple(-o for o in apex), zero), dtype=jnp.int32)
     return StencilPolygons(polygons, inward != 0, around_eye)

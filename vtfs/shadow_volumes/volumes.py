@@ -71,7 +71,7 @@ def volumes(frame: ShadowFrame, plan: ShadowPlan, about_light: bool) -> Volumes:
     nodes = node_planes(edges, inward, vertex, frame.triangles, light, frame.directional, plan.extra, about_light)
     seen = _solid_angle(corners(vertex, frame.triangles), light, frame.directional)
     edges = in_precision(edges, plan.precision)
-    return Volumes(plane_table(edges), plane_table(nodes), inward != 0, seen, origin_m(frame), frame.bias_m)
+    return Volumes(plane_table(edges), plane_table(nodes), inward[:-1] != 0, seen, origin_m(frame), frame.bias_m)
 
 
 def _solid_angle(corner: tuple[Vector, Vector, Vector], light: Vector, directional: bool) -> Float[Array, " n"]:
