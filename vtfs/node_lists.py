@@ -69,6 +69,29 @@ class NodeLists(eqx.Module):
         return NodeLists(self.triangle, start, count, node)
 
 
+_GROUPS_AT_ONCE = {"cpu": 2**13}
+"""Of which `owners` looks for the node in one step of its loop; elsewhere a step costs more than all of them."""
+
+
+def owners(start: Int[Array, " nodes_and_1"], n_groups: Int[Array, ""], capacity: int) -> Int[Array, " capacity"]:
+    """The node of each group that is used, of others any node: lists are often far shorter than their capacity."""
+    last = start.shape[0] - 2
+    width = min(capacity, _GROUPS_AT_ONCE.get(jax.default_backend(), capacity))
+    n_padded = _whole_chunks(capacity, width)
+
+    def find(state):
+        first, node = state
+        own = last_not_above(start, first + jnp.arange(width, dtype=jnp.int32))
+        return first + width, jax.lax.dynamic_update_slice_in_dim(node, own, first, 0)
+
+    state = (jnp.int32(0), jnp.zeros(n_padded, jnp.int32))
+    if width == capacity:
+        _, node = find(state)
+    else:
+        _, node = jax.lax.while_loop(lambda state: state[0] < n_groups, find, state)
+    return jnp.minimum(node[:capacity], last)
+
+
 def group_starts(count: Int[Array, " nodes"], lanes: int) -> Int[Array, " nodes_and_1"]:
     groups = -(-count // lanes)
     # Saturates: past 2^31 a total would be negative, and look as if it fitted.
@@ -171,9 +194,8 @@ def split(
     n_in, lanes_in = lists.triangle.shape
     n_groups = jnp.minimum(lists.n_groups, n_in)
 
-    # One bisection for all groups: in a loop its many small steps would each be a call.
-    node_of_group = last_not_above(lists.start, jnp.arange(_whole_chunks(n_in, chunk), dtype=jnp.int32))
-    node_of_group = jnp.minimum(node_of_group, lists.count.shape[0] - 1)
+    # Bisected for many groups at once: in the loop below its small steps would each be a call.
+    node_of_group = owners(lists.start, n_groups, _whole_chunks(n_in, chunk))
 
     def test_chunk(first, before):
         group = first + jnp.arange(chunk, dtype=jnp.int32)
@@ -218,8 +240,7 @@ def split(
     flat_below, flat_bits = below.reshape(-1), bits.reshape(-1)
     flat_triangle = lists.triangle.reshape(-1)
 
-    child_of_group = last_not_above(start, jnp.arange(_whole_chunks(capacity, chunk), dtype=jnp.int32))
-    child_of_group = jnp.minimum(child_of_group, kept.shape[0] - 1)
+    child_of_group = owners(start, n_out, _whole_chunks(capacity, chunk))
 
     def write_chunk(first):
         group = first + jnp.arange(chunk, dtype=jnp.int32)

@@ -103,8 +103,12 @@ def with_shadow_sizes(plan: ShadowPlan, sizes: tuple[int, ...]) -> ShadowPlan:
 
 _FIRST = ShadowPlan(clusters=2**12, groups=2**10, leaf_groups=2**13)
 _LARGEST = 2**26
-_FIRST_SHARE = {"z_pass": 1, "z_fail": 1, "ptsv": 4, "cluster_hierarchy": 4}
-"""Samples for one list of a leaf, where the search for capacities begins: each step of it compiles."""
+_FIRST_LISTS = {"z_pass": 2, "z_fail": 2, "ptsv": 1, "cluster_hierarchy": 1}
+"""Lists of a level for each triangle, where the search for capacities begins: each step of it compiles, and on a CPU
+what is too large is written all the same."""
+
+_FIRST_SHARE = {"z_pass": 1, "z_fail": 1, "ptsv": 4, "cluster_hierarchy": 8}
+"""Samples for one list of a leaf, likewise."""
 
 
 def shadow_grid(samples: ViewSamples, tile_px: int, depth_slices: int = 0) -> ClusterGrid:
@@ -201,7 +205,7 @@ def fitted_to_all(
     plan = replace(
         plan,
         clusters=plan.clusters or _rounded_up("clusters", n_samples // min(8, plan.tile_px), _FIRST.clusters),
-        groups=plan.groups or _rounded_up("lists", 2 * n_triangles, _FIRST.groups),
+        groups=plan.groups or _rounded_up("lists", _FIRST_LISTS[technique] * n_triangles, _FIRST.groups),
         leaf_groups=plan.leaf_groups
         or _rounded_up("leaf lists", n_samples // _FIRST_SHARE[technique], _FIRST.leaf_groups),
         pairs=plan.pairs or (_rounded_up("pairs", 4 * n_triangles, 2**10) if plan.passes == 2 else 0),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
 from vtfs.bit_lists import last_not_above, pack_bits
-from vtfs.node_lists import NodeLists
+from vtfs.node_lists import NodeLists, owners
 from vtfs.shadow_mask import ShadowPlan
 from vtfs.shadow_volumes.hierarchy import Hierarchy
 from vtfs.shadow_volumes.planes import Vector, inside
@@ -73,7 +73,7 @@ def _tested_in_chunks(
     words = max(1, n_samples // 32)
     n_groups = jnp.minimum(lists.n_groups, capacity)
     n_padded = -(-capacity // chunk) * chunk
-    item = last_not_above(lists.start, jnp.arange(n_padded, dtype=jnp.int32))
+    item = owners(lists.start, n_groups, n_padded)
     tile = hierarchy.tile_of_item[jnp.minimum(item, hierarchy.tile_of_item.shape[0] - 1)]
     triangles = jnp.concatenate([lists.triangle, jnp.zeros((n_padded - capacity, lanes), jnp.int32)])
 
@@ -101,7 +101,7 @@ def _merged(bits: UInt32[Array, "groups words"], lists: NodeLists, n_items: int)
     bits = bits[:capacity]
     longest = jnp.max(start[1:] - start[:-1])
     group = jnp.arange(capacity, dtype=jnp.int32)
-    end = start[lists.nodes() + 1]
+    end = start[(owners(start, lists.n_groups, capacity) if lists.node is None else lists.node) + 1]
 
     def double(bits, step):
         other = group + step
