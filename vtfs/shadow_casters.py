@@ -19,9 +19,9 @@ BIAS = 1e-5
 within the window (1e-6 to 1e-4) in which self-shadowing was measured to vanish. Never an absolute length."""
 
 FARTHEST_EXTENTS = 1e5
-"""A point light further than so many extents from its casters is refused. Triangles narrower than 1e-10 rad are left out,
-as float64 cannot tell on which side of them the light is; from there on these are wider than the 1e-5 of the extent
-within which rounding may decide. A directional light then casts the same shadow, within these 1e-5."""
+"""A point light further than so many extents from its casters is refused. Triangles narrower than 1e-10 rad are left
+out, as float64 cannot tell on which side of them the light is; from there on these are wider than the 1e-5 of the
+extent within which rounding may decide. A directional light then casts the same shadow, within these 1e-5."""
 
 FrontFaces = Literal["cast", "culled"]
 

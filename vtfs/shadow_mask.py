@@ -107,7 +107,7 @@ class ShadowPlan:
     def __post_init__(self):
         for name, (low, high) in _WHOLE.items():
             value = getattr(self, name)
-            if not isinstance(value, numbers.Integral) or not low <= value <= (high or value):
+            if not isinstance(value, int | np.integer) or not low <= value <= (high or value):
                 to = f"to {high}" if high else "on"
                 raise InputError(f"`ShadowPlan({name}={value!r})`: must be a whole number from {low} {to}.")
         for name, choices in _CHOICES.items():

@@ -600,7 +600,7 @@ def test_what_shadows_are_cast_with_is_checked(argument, value, message):
 
 @pytest.mark.parametrize("position", ["abc", None, (0.0, 1.0), (0.0, 1.0, np.nan), ((1.0,), 2.0, 3.0)])
 def test_a_light_without_a_place_is_refused(position):
-    with pytest.raises(InputError, match="`position_m` = .*: must be three finite numbers"):
+    with pytest.raises(InputError, match=r"`position_m` = .*: must be three finite numbers"):
         ShadowLight(position)
 
 
