@@ -67,7 +67,7 @@ def draw(workload: SceneWorkload, found: SearchResult, folder: Path) -> Drawn:
         maps = {technique: workload.shadow_maps(_config(m)) for technique, m in fastest.items()}
         pictures.append(_shadows(best, workload.shadow_maps(best), folder))
         tests = {technique: own.tests for technique, own in maps.items()}
-        unit = "triangles tested against a pixel's tile or cluster"
+        unit = "triangles (of stencils: volume polygons) tested against a pixel's tile or cluster"
         return Drawn(pictures + _heat_maps(workload, fastest, tests, unit, "log", folder), [], "log")
     lengths = {technique: workload.list_lengths(_config(m)) for technique, m in fastest.items()}
     computations = {technique: own.of_sample for technique, own in lengths.items()}

@@ -14,7 +14,16 @@ from functools import cached_property
 from pathlib import Path
 
 from vtfs.input_error import InputError
-from vtfs.parameters import PARAMETERS, SHADOW_NAMES, TECHNIQUES, Configuration, ConflictError, Value, configuration
+from vtfs.parameters import (
+    ONLY_WITH,
+    PARAMETERS,
+    SHADOW_NAMES,
+    TECHNIQUES,
+    Configuration,
+    ConflictError,
+    Value,
+    configuration,
+)
 
 LARGEST_SPACE = 100_000
 """More combinations than this are refused: counting them all would take hours."""
@@ -29,11 +38,12 @@ class Space:
     """Every combination of `values` that keeps the `constraints`, for each technique.
 
     - `values`: for each technique, the values of some of its parameters; the others stay at their default.
+      What goes with one value of another parameter only (`ONLY_WITH`) varies beside that value alone.
     - `constraints`: expressions such as `"tile_px * depth_slices <= 4096"`. One that names a parameter which
       a technique does not have does not apply to that technique.
 
     **Raises:** `InputError` where it is first enumerated, for a constraint that is no comparison of numbers and
-    parameters, for more than `LARGEST_SPACE` combinations, and for none.
+    parameters, for values that never have an effect, for more than `LARGEST_SPACE` combinations, and for none.
     """
 
     techniques: tuple[str, ...]
@@ -69,6 +79,8 @@ class Space:
         size = sum(math.prod(len(values) for values in self.values.get(name, {}).values()) for name in self.techniques)
         if size > LARGEST_SPACE:
             raise InputError(f"`parameters`: {size:,} combinations; give values for at most {LARGEST_SPACE:,}.")
+        for name in self.techniques:
+            _refuse_without_effect(self.values.get(name, {}))
         rules = [_Constraint.parse(index, text) for index, text in enumerate(self.constraints)]
         found = [
             candidate
@@ -184,10 +196,24 @@ def _space(techniques: tuple[str, ...], values: Mapping[str, tuple[Value, ...]],
     return Space(techniques, of_technique, constraints)
 
 
+def _refuse_without_effect(values: Mapping[str, tuple[Value, ...]]) -> None:
+    for name, (other, needed) in ONLY_WITH.items():
+        given = values.get(name, ())
+        if needed not in values.get(other, ()) and any(value != PARAMETERS[name].default for value in given):
+            raise InputError(
+                f"`parameters.{name}` = {list(given)}: has no effect without {other}={needed}; list {needed} in "
+                f"`parameters.{other}`, or leave {name} out."
+            )
+
+
 def _combinations(technique: str, values: Mapping[str, tuple[Value, ...]]) -> Iterable[Configuration]:
     for chosen in itertools.product(*values.values()):
+        params = dict(zip(values, chosen, strict=True))
+        for name, (other, needed) in ONLY_WITH.items():
+            if params.get(other) != needed:
+                params.pop(name, None)  # one candidate, whatever its value
         try:
-            yield configuration(technique, dict(zip(values, chosen, strict=True)))
+            yield configuration(technique, params)
         except ConflictError:  # such as cubic cells of linear slices: no candidate
             continue
 

@@ -90,6 +90,12 @@ class SceneCasters:
     opaque: Casters
     alpha: AlphaCasters
 
+    @property
+    def together(self) -> Casters:
+        """All triangles, whatever they let through."""
+        both = np.concatenate([self.opaque.triangles, self.alpha.casters.triangles])
+        return Casters(self.opaque.vertices_m, both)
+
 
 def scene_casters(scene: Scene) -> SceneCasters:
     """The triangles of all of a scene's materials."""
@@ -115,8 +121,7 @@ def scene_casters(scene: Scene) -> SceneCasters:
 
 def scene_bias_m(casters: SceneCasters) -> float:
     """The share of the extent of all casters by which samples move toward the light."""
-    both = np.concatenate([casters.opaque.triangles, casters.alpha.casters.triangles])
-    return BIAS * Casters(casters.opaque.vertices_m, both).extent_m
+    return BIAS * casters.together.extent_m
 
 
 class AlphaSurfaces(eqx.Module):

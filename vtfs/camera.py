@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vtfs.files import write_atomically
+from vtfs.flat_scenes import with_room
 from vtfs.input_error import InputError
 
 if TYPE_CHECKING:
@@ -325,8 +326,9 @@ def default_cameras(scene: Scene, viewport: Viewport, seed: int = 0) -> CameraPa
 
 
 def _standpoints(scene: Scene, rng: np.random.Generator) -> np.ndarray:
-    """Points inside the bounds, `[N, 3]`: spread evenly, and above triangles (some scenes fill little of their box)."""
-    low, high = scene.bounds_m
+    """Points inside the bounds, and before what is flat, `[N, 3]`: spread evenly, and above triangles (some scenes fill
+    little of their box)."""
+    low, high = with_room(scene.bounds_m)
     spread = low + (high - low) * rng.uniform(0.1, 0.9, (64, 3))
     centres = scene.vertices_m[scene.triangles[rng.integers(scene.n_triangles, size=192)]].mean(axis=1)
     centres[:, 1] += scene.diagonal_m * rng.uniform(0.002, 0.05, 192)

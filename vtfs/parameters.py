@@ -225,6 +225,9 @@ _BY_TREE = (*_TILES, *_SLICES, *_TREE, "batch", *_CLUSTERS, "leaf_test", *_SHADI
 _VOLUMES = ("tile_px", "branching", "batch", "planes", "feedback", "passes", "level", "front_faces", "blending")
 _STENCIL = ("tile_px", "branching", "stencil", "front_faces", "blending")
 
+ONLY_WITH: dict[str, tuple[str, Value]] = {"level": ("passes", 2)}
+"""Parameters that say something beside one value of another parameter only; beside others they are at their default."""
+
 ACCURACY = ("gbuffer", "light_cutoff", "approximate", "front_faces", "stencil", "around_eye")
 """Parameters that change the image: their defaults are exact."""
 
@@ -259,6 +262,12 @@ SHADOW_REFERENCES = ("shadow_rays", "brute_force")
 
 LISTS_OF_SHADOWED = "clustered_deferred"
 """Whose light lists, at its defaults, a shadow technique shades with."""
+
+TECHNIQUE_GROUPS: dict[str, tuple[str, ...]] = {
+    "all": tuple(name for name in TECHNIQUES if name not in SHADOW_NAMES),
+    "shadows": tuple(name for name in SHADOW_NAMES if name not in SHADOW_REFERENCES),
+}
+"""Names that stand for several techniques wherever several can be named."""
 
 TUNED_TECHNIQUES = ("forward", "tiled_deferred", "volume_tiled_bvh")
 """What a search compares unless the user says otherwise. Nothing is rasterised here, so that techniques which differ
@@ -333,10 +342,10 @@ def configuration(technique: str, params: Mapping[str, object] | None = None) ->
     What has no effect beside other values takes its default: `tile_px` beside `grid`, say.
 
     **Raises:** `InputError` for an unknown technique, a parameter that the technique does not have,
-    or a value out of range; `ConflictError` for values that exclude each other.
+    or a value out of range; `ConflictError` for values that exclude each other, and for one that goes with a value of
+    another parameter only (`ONLY_WITH`).
     """
-    if technique not in TECHNIQUES:
-        raise InputError(f"technique `{technique}`: unknown; choose from {', '.join(TECHNIQUES)}.")
+    _require_technique(technique)
     names = TECHNIQUES[technique]
     given = dict(params or {})
     for name in given:
@@ -349,6 +358,26 @@ def configuration(technique: str, params: Mapping[str, object] | None = None) ->
     }
     settled = _settled(technique, parsed)
     return Configuration(technique, tuple((name, settled[name]) for name in names))
+
+
+def named_techniques(names: Sequence[str]) -> tuple[str, ...]:
+    """Techniques by their own names or those of groups: each once, in the order of the names.
+
+    **Raises:** `InputError` for an unknown name, or none.
+    """
+    members = [TECHNIQUE_GROUPS.get(name, (name,)) for name in names]
+    found = tuple(dict.fromkeys(name for group in members for name in group))
+    for name in found or ("",):
+        _require_technique(name)
+    return found
+
+
+def _require_technique(name: str) -> None:
+    if name in TECHNIQUE_GROUPS:
+        members = ", ".join(TECHNIQUE_GROUPS[name])
+        raise InputError(f"technique `{name}`: is a group, and one technique is needed; choose from {members}.")
+    if name not in TECHNIQUES:
+        raise InputError(f"technique `{name}`: unknown; choose from {', '.join(TECHNIQUES)}.")
 
 
 def casts_shadows(techniques: Sequence[str]) -> bool:
@@ -424,8 +453,12 @@ def _settled(technique: str, params: dict[str, Value]) -> dict[str, Value]:
                 f"parameter `depth_scheme` = {params['depth_scheme']!r} with depth_slices=0: cubic cells are "
                 "`self_similar`; give depth_slices of 1 or more."
             )
-    if params.get("passes") == 1:
-        default("level")
+    for name, (other, needed) in ONLY_WITH.items():
+        if name in params and params[name] != default_value(technique, name) and params[other] != needed:
+            raise ConflictError(
+                f"parameter `{name}` = {params[name]!r} with {other}={params[other]}: has no effect; give "
+                f"{other}={needed}, or leave {name} out."
+            )
     if params.get("leaf_test") == "box":
         default("cull")  # the sphere is not tested
     if "cull" in params and "bounds" in params:

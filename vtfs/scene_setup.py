@@ -15,6 +15,7 @@ import numpy as np
 from vtfs.cache import cached
 from vtfs.camera import CameraPath, Viewport, default_cameras, load_cameras
 from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
+from vtfs.flat_scenes import with_room
 from vtfs.gallery import GALLERY, build_scene
 from vtfs.gbuffer_files import load_gbuffer
 from vtfs.input_error import InputError
@@ -146,10 +147,10 @@ class SceneSetup:
         n_lights, options = self._lights, self._options
 
         def scatter() -> dict[str, np.ndarray]:
-            visible = [self._some_positions(frame) for frame in self.counted_frames]
-            scattered = scatter_lights(
-                self.bounds_m, n_lights, self.seed, np.concatenate(visible), options.lights_per_sample, options.density
-            )
+            visible = np.concatenate([self._some_positions(frame) for frame in self.counted_frames])
+            seen_from_m = np.mean([pose.eye_m for pose in self.cameras.poses], axis=0)
+            box_m = with_room(self.bounds_m, seen_from_m)
+            scattered = scatter_lights(box_m, n_lights, self.seed, visible, options.lights_per_sample, options.density)
             return {field.name: getattr(scattered, field.name) for field in fields(scattered)}
 
         asked = (n_lights, self.seed, options.lights_per_sample, options.density)

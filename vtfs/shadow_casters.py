@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -15,6 +17,11 @@ if TYPE_CHECKING:
 BIAS = 1e-5
 """Samples move toward the light by this share of the casters' extent before the test against a triangle's own plane;
 within the window (1e-6 to 1e-4) in which self-shadowing was measured to vanish. Never an absolute length."""
+
+FARTHEST_EXTENTS = 1e5
+"""A point light further than so many extents from its casters is refused. Triangles narrower than 1e-10 rad are left
+out, as float64 cannot tell on which side of them the light is; from there on these are wider than the 1e-5 of the
+extent within which rounding may decide. A directional light then casts the same shadow, within these 1e-5."""
 
 FrontFaces = Literal["cast", "culled"]
 
@@ -54,13 +61,19 @@ class Casters:
     def n_triangles(self) -> int:
         return len(self.triangles)
 
+    @cached_property
+    def box_m(self) -> tuple[np.ndarray, np.ndarray]:
+        """Low and high corner of the box of all vertices that triangles use; the origin without any."""
+        if not len(self.triangles):
+            return np.zeros(3), np.zeros(3)
+        used = self.vertices_m[self.triangles.ravel()]
+        return used.min(axis=0), used.max(axis=0)
+
     @property
     def extent_m(self) -> float:
-        """Diagonal of the box of all vertices that triangles use; what the bias is a share of."""
-        if not len(self.triangles):
-            return 0.0
-        used = self.vertices_m[self.triangles.ravel()]
-        return float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
+        """Diagonal of the box; what the bias is a share of."""
+        low, high = self.box_m
+        return float(np.linalg.norm(high - low))
 
 
 def welded(vertices_m: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -91,8 +104,12 @@ class ShadowLight:
     directional: bool = False
 
     def __post_init__(self):
-        if len(self.position_m) != 3 or not np.isfinite(self.position_m).all():
-            raise InputError(f"shadow light `position_m` = {self.position_m}: must be three finite numbers.")
+        try:
+            position = np.asarray(self.position_m, np.float64)
+        except (TypeError, ValueError):  # no numbers, or of ragged shape
+            position = np.zeros(0)
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise InputError(f"shadow light `position_m` = {self.position_m!r}: must be three finite numbers.")
         if self.directional and not np.any(self.position_m):
             raise InputError("shadow light `position_m` = (0, 0, 0): a directional light needs a direction toward it.")
 
@@ -104,6 +121,21 @@ class ShadowLight:
             scaled = position / np.abs(position).max()  # so that no square overflows or vanishes
             return np.append(scaled / np.linalg.norm(scaled), 0.0)
         return np.append(position, 1.0)
+
+
+def require_near(light: ShadowLight, casters: Casters) -> None:
+    """**Raises:** `InputError` for a point light further than `FARTHEST_EXTENTS` from casters that have an extent."""
+    if light.directional or not casters.extent_m:
+        return
+    low, high = casters.box_m
+    place = np.asarray(light.position_m, np.float64)
+    distance_m = math.hypot(*(place - np.clip(place, low, high)))  # whose squares may not overflow
+    if distance_m > FARTHEST_EXTENTS * casters.extent_m:
+        raise InputError(
+            f"shadow light `position_m` = ({', '.join(f'{c:g}' for c in place)}): is {distance_m:g} m from casters of "
+            f"{casters.extent_m:g} m, and must be within {FARTHEST_EXTENTS:g} of their extents, beyond which float64 "
+            "cannot tell small triangles apart; make it a directional light."
+        )
 
 
 def opaque_casters(scene: Scene) -> Casters:

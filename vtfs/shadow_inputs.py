@@ -23,7 +23,7 @@ from vtfs.layers import Layers
 from vtfs.light_shadows import MAX_SHADOW_LIGHTS, CastMask, ShadowSlots
 from vtfs.lights import Lights
 from vtfs.parameters import Configuration
-from vtfs.shadow_casters import FrontFaces, ShadowLight
+from vtfs.shadow_casters import FrontFaces, ShadowLight, require_near
 from vtfs.shadow_mask import (
     CastersOnDevice,
     ShadowFrame,
@@ -133,6 +133,8 @@ class FrameShadows:
         self.views = (samples, *(layer.samples for layer in samples.layers.transparent))
         suns = scene.suns
         chosen = brightest_lights(samples, lights, scene.n_lights)
+        for place in lights.position_m[chosen].tolist():
+            require_near(ShadowLight(tuple(place)), scene.together)
         if not len(chosen) and not suns.n_lights:
             # A frame that no light lights is a dark frame of its path: one of them casts on no sample.
             chosen = np.flatnonzero(lights.range_m > 0)[: min(scene.n_lights, 1)]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from vtfs.frame import cast_counted, image_on_host
 from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
-from vtfs.parameters import SHADOW_REFERENCES, Configuration
+from vtfs.parameters import SHADOW_REFERENCES, STENCIL_NAMES, Configuration
 from vtfs.techniques import REGISTRY
 
 
@@ -19,12 +20,13 @@ class ShadowMaps:
 
     - `lit`: lights that would light each sample; `stopped`: how much of them does not reach it: 1 of a light that it
       lies in the shadow of, a share of one that comes through panes (mean of the colours).
-    - `tests`: triangles that its tile or cluster is tested against; of references 0.
+    - `tests`: what its tile or cluster is tested against, `tested` in words; of references 0.
     """
 
     lit: np.ndarray
     stopped: np.ndarray
     tests: np.ndarray
+    tested: Literal["triangles", "volume polygons"]
 
     @property
     def share_stopped(self) -> float:
@@ -43,11 +45,12 @@ def shadow_maps(config: Configuration, inputs: FrameInputs) -> ShadowMaps | None
         masks = shadows.reference_masks(config)[:n_slots]
         shadowed = [from_runs(np.asarray(mask.shadowed), inputs.viewport) for mask in masks]
         left = [image_on_host(mask.transmittance, inputs) for mask in masks if mask.transmittance]
-        return ShadowMaps(lit, _stopped(shadowed, left), np.zeros_like(lit))
+        return ShadowMaps(lit, _stopped(shadowed, left), np.zeros_like(lit), "triangles")
     cast = cast_counted(config, inputs)
     opaque, alpha = cast.opaque[:n_slots], cast.alpha[:n_slots]
     stopped = _stopped([each.shadowed for each in opaque], cast.transmittance[:n_slots])
-    return ShadowMaps(lit, stopped, np.sum([each.tests for each in (*opaque, *alpha)], axis=0))
+    tests = np.sum([each.tests for each in (*opaque, *alpha)], axis=0)
+    return ShadowMaps(lit, stopped, tests, "volume polygons" if config.technique in STENCIL_NAMES else "triangles")
 
 
 def _stopped(shadowed: list[np.ndarray], left: list[np.ndarray]) -> np.ndarray:

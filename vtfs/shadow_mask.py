@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -13,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vtfs.alpha_casters import Casting
 from vtfs.cluster_grid import ClusterGrid
 from vtfs.gbuffer import Fragments, Positions, to_runs
+from vtfs.input_error import InputError
 from vtfs.layers import Layers
 from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight, welded
 from vtfs.shadow_volumes.planes import Extra, Precision
@@ -58,6 +60,7 @@ class ShadowFrame(eqx.Module):
 class ShadowPlan:
     """What is static in a shadow program: it fixes array shapes, or which tests there are.
 
+    - `tile_px`: 1 to 256; `branching`: children of a node, any whole number from 2 on.
     - `extra`: planes for rejection besides the four of a volume.
     - `feedback`: triangles go on only into nodes that no triangle of the same or an earlier batch accepts, and with
       batches not to samples that earlier ones shadow; those that block most of the light come first. Same mask, fewer
@@ -76,6 +79,8 @@ class ShadowPlan:
       clusters, of the nodes of a level of a compact tree.
     - `level_groups`: capacities of each level's lists. Then levels are unrolled and nothing loops, which suits a GPU;
       without them one loop runs over levels of `groups`, in chunks, which suits a CPU.
+
+    **Raises:** `InputError` that names the field, the value and what is allowed.
     """
 
     tile_px: int = 8
@@ -98,6 +103,39 @@ class ShadowPlan:
     cells: int = 0
     nodes: int = 0
     level_groups: tuple[int, ...] = ()
+
+    def __post_init__(self):
+        for name, (low, high) in _WHOLE.items():
+            value = getattr(self, name)
+            if not isinstance(value, int | np.integer) or not low <= value <= (high or value):
+                to = f"to {high}" if high else "on"
+                raise InputError(f"`ShadowPlan({name}={value!r})`: must be a whole number from {low} {to}.")
+        for name, choices in _CHOICES.items():
+            require_choice(f"ShadowPlan({name}={getattr(self, name)!r})", getattr(self, name), choices)
+        if self.level and self.passes == 1:
+            raise InputError(
+                f"`ShadowPlan(level={self.level})`: is where the first of two passes ends, and this plan has one; give "
+                "passes=2, or level=0."
+            )
+
+
+_FLAG = (False, True)
+_WHOLE = {
+    "tile_px": (1, 256), "branching": (2, 0), "batch": (0, 0), "passes": (1, 2), "level": (0, 24), "clusters": (0, 0),
+    "groups": (0, 0), "leaf_groups": (0, 0), "pairs": (0, 0), "cells": (0, 0), "nodes": (0, 0),
+}  # fmt: skip
+"""Fields of a plan that are whole numbers, with the least and the largest value; 0: no largest one."""
+
+_CHOICES = {
+    "bounds": get_args(Bounds), "extra": get_args(Extra), "feedback": _FLAG, "tree": get_args(Tree),
+    "stencil": get_args(Stencil), "around_eye": _FLAG, "precision": get_args(Precision), "blending": get_args(Casting),
+}  # fmt: skip
+
+
+def require_choice(given: str, value: object, choices: tuple[object, ...]) -> None:
+    """**Raises:** `InputError` where a value is none of its choices; `given` says what was given."""
+    if value not in choices:
+        raise InputError(f"`{given}`: must be one of {', '.join(map(str, choices))}.")
 
 
 class ShadowCounts(eqx.Module):
@@ -224,9 +262,14 @@ def shadow_frame(
 
     - `receives`: samples that are tested, bool `[h, w]`; all valid ones unless given.
     - `positions`: of the samples, if they are on the device already.
+
+    **Raises:** `InputError` for `receives` of another shape, a bias that is no length, or unknown `front_faces`.
     """
     camera = samples.camera
-    mask = samples.valid if receives is None else receives & samples.valid
+    mask = samples.valid if receives is None else _receivers(receives, samples) & samples.valid
+    if not isinstance(bias_m, numbers.Real) or not 0 <= bias_m < np.inf:
+        raise InputError(f"`bias_m` = {bias_m!r}: must be a finite number of metres, 0 or more.")
+    require_choice(f"front_faces={front_faces!r}", front_faces, get_args(FrontFaces))
     # Transparent layers are views of their own.
     alone = replace(samples, layers=Layers())
     with jax.enable_x64(True):
@@ -246,6 +289,15 @@ def shadow_frame(
             counted=put(np.bool_(counted)),
             directional=light.directional,
         )
+
+
+def _receivers(receives: np.ndarray, samples: ViewSamples) -> np.ndarray:
+    given, shape = np.asarray(receives), samples.valid.shape
+    if given.dtype != bool or given.shape != shape:
+        raise InputError(
+            f"`receives`: is {given.dtype} of shape {given.shape}; must be bool of shape {shape}, one for each sample."
+        )
+    return given
 
 
 def uncounted(frame: ShadowFrame) -> ShadowFrame:

@@ -13,7 +13,6 @@ from vtfs.alpha_casters import (
     Casting,
     SceneCasters,
     alpha_on_device,
-    scene_bias_m,
     scene_casters,
 )
 from vtfs.directional_lights import DirectionalLights
@@ -65,11 +64,14 @@ class ShadowScene:
         return casters_on_device(self.alpha.casters), alpha_on_device(self.alpha)
 
     @cached_property
+    def together(self) -> Casters:
+        """All casters, whatever they let through."""
+        return self.casters if self.alpha is None else SceneCasters(self.casters, self.alpha).together
+
+    @cached_property
     def bias_m(self) -> float:
         """By which samples move toward the light: a share of the extent of all casters."""
-        return (
-            default_bias_m(self.casters) if self.alpha is None else scene_bias_m(SceneCasters(self.casters, self.alpha))
-        )
+        return default_bias_m(self.together)
 
     def blending(self, config: Configuration) -> Casting:
         """What alpha casters do to light; `opaque` also where there are none.

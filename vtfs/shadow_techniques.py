@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import numbers
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ from vtfs.cluster_grid import cluster_grid
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.parameters import Configuration
-from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight
+from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, require_near
 from vtfs.shadow_mask import (
     ShadowFrame,
     ShadowMask,
@@ -116,6 +117,8 @@ def shadow_grid(samples: ViewSamples, tile_px: int, depth_slices: int = 0) -> Cl
 
     **Raises:** `InputError` where it has more columns, rows or slices than keys can tell apart.
     """
+    if not isinstance(depth_slices, numbers.Integral) or depth_slices < 0:
+        raise InputError(f"`depth_slices` = {depth_slices!r}: must be a whole number from 0 to {2**KEY_BITS:,}.")
     depths = -samples.position_m[..., 2][samples.valid]
     return grid_of(samples.camera, float(depths.max(initial=samples.camera.near_m)), tile_px, depth_slices)
 
@@ -295,13 +298,30 @@ def cast_shadows(
 
     **Arguments:** as of `shadow_frame`; `bias_m` is 1e-5 of the casters' extent unless given.
 
-    **Raises:** `InputError` for an unknown technique, or where no capacity holds the frame.
+    **Raises:** `InputError` for an unknown technique, a point light further than `FARTHEST_EXTENTS`, a wrong argument,
+    or where no capacity holds the frame.
     """
     if technique not in SHADOW_TECHNIQUES:
         raise InputError(f"shadow technique `{technique}`: unknown; choose from {', '.join(SHADOW_TECHNIQUES)}.")
+    require_near(light, casters)
     bias = default_bias_m(casters) if bias_m is None else bias_m
+    return cast_by_bias(technique, plan, samples, casters, light, depth_slices, front_faces, receives, bias)
+
+
+def cast_by_bias(
+    technique: str,
+    plan: ShadowPlan,
+    samples: ViewSamples,
+    casters: Casters,
+    light: ShadowLight,
+    depth_slices: int,
+    front_faces: FrontFaces,
+    receives: np.ndarray | None,
+    bias_m: float,
+) -> CastShadows:
+    """`cast_shadows` of casters that may be a small part of those that the light is near to."""
     grid = shadow_grid(samples, plan.tile_px, depth_slices)
-    frame = shadow_frame(samples, casters_on_device(casters), light, grid, bias, receives, front_faces)
+    frame = shadow_frame(samples, casters_on_device(casters), light, grid, bias_m, receives, front_faces)
     plan = fitted(technique, plan, frame)
     return on_host(run_program(technique, plan, frame), plan, frame)
 

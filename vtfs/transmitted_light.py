@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +15,9 @@ from jaxtyping import Array, UInt32
 from vtfs.alpha_casters import AlphaSurfaces, Blending, SceneCasters, alpha_on_device, scene_bias_m
 from vtfs.gbuffer import Fragments, from_runs
 from vtfs.input_error import InputError
-from vtfs.shadow_casters import FrontFaces, ShadowLight
-from vtfs.shadow_mask import ShadowFrame, ShadowPlan, casters_on_device, shadow_frame
-from vtfs.shadow_techniques import CastShadows, cast_shadows, fitted_to_all, on_host, shadow_grid
+from vtfs.shadow_casters import FrontFaces, ShadowLight, require_near
+from vtfs.shadow_mask import ShadowFrame, ShadowPlan, casters_on_device, require_choice, shadow_frame
+from vtfs.shadow_techniques import CastShadows, cast_by_bias, fitted_to_all, on_host, shadow_grid
 from vtfs.shadow_volumes.transmittance import Transmitted, transmit
 from vtfs.view_samples import ViewSamples
 
@@ -78,21 +79,22 @@ def transmitted_light(
     - `front_faces`: of opaque casters alone, as panes and leaves are not closed.
     - `bias_m`: 1e-5 of the extent of all casters unless given.
 
-    **Raises:** `InputError` for an unknown technique or one that has no alpha casters, or where no capacity holds the
-    frame.
+    **Raises:** `InputError` as `cast_shadows`, and for an unknown `blending` or a technique without alpha casters.
     """
     if technique not in ALPHA_TECHNIQUES:
         raise InputError(
             f"shadow technique `{technique}`: casts no alpha shadows; use {' or '.join(ALPHA_TECHNIQUES)}."
         )
+    require_choice(f"blending={blending!r}", blending, get_args(Blending))
+    require_near(light, casters.together)
     bias = scene_bias_m(casters) if bias_m is None else bias_m
-    receives = samples.valid if receives is None else receives & samples.valid
-    opaque = cast_shadows(
+    opaque = cast_by_bias(
         technique, plan, samples, casters.opaque, light, depth_slices, front_faces, receives, bias
     )  # fmt: skip
+    left_lit = ~opaque.shadowed if receives is None else receives & ~opaque.shadowed
     grid = shadow_grid(samples, plan.tile_px, depth_slices)
     on_device = casters_on_device(casters.alpha.casters)
-    frame = shadow_frame(samples, on_device, light, grid, bias, receives & ~opaque.shadowed)
+    frame = shadow_frame(samples, on_device, light, grid, bias, left_lit)
     surfaces = alpha_on_device(casters.alpha)
     words = np.array(stream, np.uint32)
 

@@ -107,6 +107,18 @@ def test_a_file_is_read_and_what_a_technique_lacks_is_ignored_for_it(space_file)
     ]
 
 
+def test_the_level_of_a_second_pass_varies_beside_two_passes_alone(space_file):
+    path = space_file("[parameters]\npasses = [1, 2]\nlevel = [1, 2]\n")
+    found = load_space(path, ["ptsv", "z_fail"]).configurations()
+    assert [str(c) for c in found] == ["ptsv", "ptsv passes=2 level=1", "ptsv passes=2 level=2", "z_fail"]
+    assert [str(c) for c in load_space(space_file("[parameters]\nlevel = [0]"), ["ptsv"]).configurations()] == ["ptsv"]
+    for passes in ("", "passes = [1]"):
+        with pytest.raises(
+            InputError, match=r"`parameters.level` = \[0, 2\]: has no effect without passes=2; list 2 in"
+        ):
+            load_space(space_file(f"[parameters]\nlevel = [0, 2]\n{passes}"), ["ptsv", "cluster_hierarchy"])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

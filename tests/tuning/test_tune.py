@@ -18,6 +18,7 @@ from vtfs.frame import frame_program
 from vtfs.frame_sizes import CapacityError
 from vtfs.gallery import build_scene
 from vtfs.gbuffer_files import save_gbuffer
+from vtfs.input_error import InputError
 from vtfs.lights import save_lights
 from vtfs.scene import save_scene
 from vtfs.scene_setup import SceneOptions, set_up
@@ -138,6 +139,25 @@ def test_shadows_that_cannot_be_compared_are_refused_before_anything_is_counted(
     scene = ("conservatory", "--triangles", "1000", "--size", "64x36", "--lights", "20")
     own = ("--techniques", "z_pass") if space is None else ("--techniques", "ptsv", "--space", space)
     is_refused(vtfs("tune", *scene, *own, "--out", "out"), "z_pass" if space is None else "`blending` = grey, coloured")
+
+
+def test_groups_stand_in_lists_with_single_techniques(monkeypatch):
+    scene = ("conservatory", "--triangles", "1000", "--size", "64x36", "--lights", "20", "--out", "out")
+    is_refused(vtfs("tune", *scene, "--techniques", "shadows,tiled_deferred"), "one casts shadows, the other does not")
+    is_refused(vtfs("tune", *scene, "--techniques", "all,brute_force"), "brute_force", "is not timed")
+    asked = []
+
+    def only_asked(setup, options, *_):
+        asked.append(options)
+        raise InputError("enough")
+
+    monkeypatch.setattr("tuning.tune.tune", only_asked)
+    for named in ("shadows", "ptsv,shadows,z_fail", "ptsv"):
+        is_refused(vtfs("tune", *scene, "--techniques", named), "enough")
+    group, mixed, single = [(options.techniques, options.keep) for options in asked]
+    assert group == (("z_pass", "z_fail", "ptsv", "cluster_hierarchy"), ())
+    assert mixed == (("ptsv", "z_pass", "z_fail", "cluster_hierarchy"), ("ptsv", "z_fail"))
+    assert single == (("ptsv",), ("ptsv",))
 
 
 def test_shadow_techniques_are_tuned_as_others_and_not_among_them():

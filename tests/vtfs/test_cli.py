@@ -17,7 +17,14 @@ from vtfs.camera import Viewport, load_cameras, save_cameras
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
 from vtfs.gallery import GALLERY, build_scene
-from vtfs.parameters import PARAMETERS, TECHNIQUES, TUNED_TECHNIQUES, configuration
+from vtfs.parameters import (
+    PARAMETERS,
+    SHADOW_NAMES,
+    TECHNIQUE_GROUPS,
+    TECHNIQUES,
+    TUNED_TECHNIQUES,
+    configuration,
+)
 from vtfs.scene import save_scene
 from vtfs.scene_setup import SceneOptions, set_up
 
@@ -81,7 +88,7 @@ def test_scenes_and_techniques_list_everything_there_is():
     scenes, techniques = vtfs("scenes"), vtfs("techniques")
     assert scenes.code == techniques.code == 0 and scenes.err == techniques.err == ""
     assert all(name in scenes.out for name in GALLERY)
-    assert all(name in techniques.out for name in (*TECHNIQUES, *PARAMETERS))
+    assert all(name in techniques.out for name in (*TECHNIQUES, *TECHNIQUE_GROUPS, *PARAMETERS))
 
 
 def test_doctor_names_the_device_the_versions_and_the_cache():
@@ -163,6 +170,14 @@ def test_a_space_without_a_file_prints_a_record_a_configuration():
     assert [record["params"]["tile_px"] for record in ran.json] == [8, 32]
 
 
+def test_a_space_is_counted_for_groups_and_single_techniques_each_once_in_their_order():
+    write("space.toml", "[parameters]\nlight_cutoff = [0.5]\n")
+    named = "volume_tiled_bvh, all,forward,volume_tiled_bvh"
+    ran = vtfs("count", *SMALL, "--technique", named, "--space", "space.toml", "--frame", "0", "--json", "-")
+    others = [name for name in TECHNIQUES if name not in SHADOW_NAMES and name != "volume_tiled_bvh"]
+    assert [record["technique"] for record in ran.json] == ["volume_tiled_bvh", *others]
+
+
 # render
 
 
@@ -189,6 +204,25 @@ def test_a_camera_that_sees_nothing(technique):
     assert ran.code == 0 and ran.err == "" and "at most 0" in ran.out and "nan" not in ran.out
     counts = vtfs("count", *arguments, "--json", "-").json["frames"]
     assert len(counts) == 1 and counts[0]["samples"] == counts[0]["lighting_computations"] == 0
+
+
+def test_a_heat_map_of_no_tests_replaces_that_of_an_earlier_run():
+    away = CAMERA | {"frames": [{"eye": [1e3, 1, 0], "target": [2e3, 1, 0], "up": [0, 1, 0]}]}
+    write("away.json", json.dumps(away))
+    arguments = ("render", "street", "--triangles", "1000", "--lights", "20", "--cameras", "away.json", "--json", "-")
+    out = Path("out")
+    out.mkdir()
+    for technique, has_tests in (("z_fail", True), ("shadow_rays", False)):
+        file = out / f"shadow_tests_{technique}_0000.png"
+        file.write_bytes(b"of an earlier run")
+        (written,) = vtfs(*arguments, "--technique", technique, "--out", out).json["pictures"]
+        assert ("shadow_tests" in written) == has_tests
+        if has_tests:
+            with Image.open(file) as picture:
+                assert not np.asarray(picture).any()
+    ran = vtfs("render", *SMALL, "--technique", "z_fail", "--out", out)
+    assert "(volume polygons that each pixel's tile or cluster is tested against: " in ran.out
+    is_refused(vtfs("render", *SMALL, "--technique", "shadows"), "`shadows`", "is a group", "cluster_hierarchy")
 
 
 def test_one_pixel_and_one_light():
@@ -389,6 +423,12 @@ def test_a_light_file_that_is_wrong(content, words):
         (("--lights-per-sample", "0"), ("--lights-per-sample", "equal to 1")),
         (("--triangles", "5"), ("5", "1000")),
         (("--space", "none.toml"), ("none.toml",)),
+        (("--space", "space.toml", "--set", "tile_px=8"), ("--set tile_px=8", "without --space")),
+        (("--technique", "shadows"), ("`shadows`", "is a group", "z_pass, z_fail, ptsv, cluster_hierarchy")),
+        (("--technique", "all", "--frame", "0"), ("`all`", "is a group", "forward, deferred")),
+        (("--technique", "shadows,magic", "--space", "space.toml"), ("`magic`", "unknown")),
+        (("--technique", ",", "--space", "space.toml"), ("technique ``", "unknown")),
+        (("--technique", "ptsv", "--set", "level=2"), ("`level` = 2", "passes=1", "give passes=2")),
         (("--out", "x.csv"), ("--out", "--space")),
         (("--json", "file/x.json"), ("--json file/x.json", "cannot be written")),
         (("--json", "."), ("--json .", "is a folder")),

@@ -143,6 +143,13 @@ def test_cubic_cells_are_self_similar_only(scheme):
     assert configuration("volume_tiled_bvh", {"depth_scheme": scheme, "depth_slices": 2})["depth_scheme"] == scheme
 
 
+def test_the_level_of_a_second_pass_goes_with_two_passes():
+    with pytest.raises(ConflictError, match="`level` = 3 with passes=1: has no effect; give passes=2, or leave level"):
+        configuration("ptsv", {"level": 3})
+    assert configuration("ptsv", {"level": 0, "passes": 1}) == configuration("ptsv")
+    assert configuration("ptsv", {"level": 3, "passes": 2})["level"] == 3
+
+
 def test_a_tiled_technique_takes_a_grid_of_one_slice():
     assert configuration("tiled_deferred", {"grid": "16x9x1"})["grid"] == "16x9x1"
     with pytest.raises(ConflictError, match=r'`grid` = \'16x9x24\': tiles of `tiled_deferred` .*give "16x9x1"'):

@@ -12,7 +12,7 @@ from vtfs.gallery import build_scene
 from vtfs.gbuffer_files import save_gbuffer
 from vtfs.input_error import InputError
 from vtfs.lights import point_lights, save_lights
-from vtfs.scene import save_scene
+from vtfs.scene import Material, Scene, save_scene
 from vtfs.scene_setup import DEFAULT_LIGHTS, SceneOptions, set_up
 
 SIZE = Viewport(64, 36)
@@ -83,6 +83,23 @@ def test_lights_reach_a_visible_sample_as_often_as_is_asked():
             gap = np.linalg.norm(positions[:, None] - setup.lights.position_m, axis=-1)
             reached.append((gap <= setup.lights.range_m).sum(axis=1))
         assert np.median(np.concatenate(reached)) == pytest.approx(asked, abs=1)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_flat_scene_is_lit_and_seen_from_the_side_of_the_eye(tmp_path, axis, side):
+    """A square across an axis: in its own plane every light would be edge-on."""
+    corners = np.array([[-2.0, -2], [2, -2], [2, 2], [-2, 2]])
+    vertices = np.insert(corners, axis, 7.0, axis=1)
+    normal = np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0])[axis]
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])[:, :: int(side * np.sign(normal))]
+    scene = Scene("flat", vertices, triangles, None, np.zeros(2, int), (Material(name="flat"),))
+    save_scene(scene, tmp_path / "flat.glb")
+    setup = set_up(SceneOptions(str(tmp_path / "flat.glb"), viewport=SIZE, lights="200"))
+    assert max(setup.samples(frame).n_valid for frame in setup.counted_frames) > 100
+    assert side * (setup.cameras.poses[0].eye_m[axis] - 7) > 0
+    heights = side * (setup.lights.position_m[:, axis] - 7)
+    assert heights.min() >= 0 and heights.mean() == pytest.approx(0.2, rel=0.2)  # of 0 to 0.4
 
 
 def test_lights_are_the_same_for_the_same_seed_and_only_for_that():

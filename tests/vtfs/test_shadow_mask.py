@@ -38,7 +38,7 @@ from vtfs.shadow_references import (
     kept_casters,
     view_points_m,
 )
-from vtfs.shadow_techniques import cast_shadows, fitted, on_host, run_program, shadow_grid, shadow_program
+from vtfs.shadow_techniques import cast_by_bias, cast_shadows, fitted, on_host, run_program, shadow_grid, shadow_program
 from vtfs.shadow_volumes.full_tree import n_cells, require_room
 from vtfs.shadow_volumes.volumes import volumes
 from vtfs.shadow_volumes.walk import restart_level
@@ -124,8 +124,11 @@ def test_a_directional_light_shadows_what_brute_force_says(technique, plan):
         rng = np.random.default_rng(seed)
         samples, casters, light = surface_samples(camera, seed), soup(camera, rng), light_of(camera, "directional", rng)
         bias_m = default_bias_m(casters)
-        mask = cast(technique, plan, samples, casters, light, bias_m).shadowed
-        assert_equal_outside_the_bands(mask, samples, casters, light, bias_m, 0.01)
+        front_faces: FrontFaces = "culled" if seed % 2 else "cast"
+        found = cast(technique, plan, samples, casters, light, bias_m, front_faces)
+        kept = kept_casters(casters, light, front_faces)
+        assert_equal_outside_the_bands(found.shadowed, samples, kept, light, bias_m, 0.01)
+        assert found.counts["casters"] == kept.n_triangles  # none is seen edge-on
 
 
 def balls(camera: Camera, rng: np.random.Generator) -> Casters:
@@ -157,8 +160,10 @@ def test_stencils_shadow_what_brute_force_says(technique, kinds):
             eye = ShadowLight(camera.eye_m)
             points = view_points_m(samples, samples.valid)
             receives[samples.valid] = ~brute_force(points, casters, eye, 0.0, np.array(camera.eye_m))
-        found = cast(technique, CLUSTERS, samples, casters, light, bias_m, receives=receives)
-        assert_equal_outside_the_bands(found.shadowed, samples, casters, light, bias_m, 0.02, receives)
+        front_faces: FrontFaces = "culled" if seed > 4 else "cast"
+        found = cast(technique, CLUSTERS, samples, casters, light, bias_m, front_faces, receives)
+        kept = kept_casters(casters, light, front_faces)
+        assert_equal_outside_the_bands(found.shadowed, samples, kept, light, bias_m, 0.02, receives)
         n_shadowed += found.shadowed.sum()
         assert found.counts["test_and_set"] >= found.shadowed.sum()
     assert n_shadowed > 100
@@ -550,3 +555,76 @@ def test_every_variant_on_a_real_scene(technique, plan, frame):
     found = classify(points, differs, casters, light, default_bias_m(casters), np.array(samples.camera.eye_m))
     assert found.errors == 0 and found.total <= 1e-3 * len(points)
     assert not mask[~receives].any() and 0.02 < reference.mean() < 0.98
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "allowed"),
+    [
+        ("tile_px", 0, "a whole number from 1 to 256"),
+        ("tile_px", 8.5, "a whole number from 1 to 256"),
+        ("branching", 1, "a whole number from 2 on"),
+        ("batch", -1, "a whole number from 0 on"),
+        ("passes", 3, "a whole number from 1 to 2"),
+        ("level", -1, "a whole number from 0 to 24"),
+        ("level", 2, "where the first of two passes ends, and this plan has one; give passes=2"),
+        ("bounds", "packed", "one of explicit, implicit"),
+        ("extra", "on", "one of off, vertex, silhouette"),
+        ("feedback", "off", "one of False, True"),
+        ("tree", "x", "one of compact, full"),
+        ("stencil", "x", "one of unlimited, wrap, saturate"),
+        ("precision", "float16", "one of float64, float32"),
+        ("blending", "x", "one of opaque, grey, coloured, stochastic"),
+    ],
+)
+def test_a_wrong_plan_is_refused_by_name(field, value, allowed):
+    with pytest.raises(InputError, match=rf"`ShadowPlan\({field}={value!r}\)`: .*{allowed}"):
+        ShadowPlan(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "message"),
+    [
+        ("receives", np.ones((3, 5), bool), r"`receives`: is bool of shape \(3, 5\); must be bool of shape \(17, 33\)"),
+        ("receives", np.ones((17, 33)), "`receives`: is float64 of shape"),
+        ("bias_m", float("nan"), "`bias_m` = nan: must be a finite number"),
+        ("bias_m", -1e-3, "`bias_m` = -0.001: must be a finite number"),
+        ("front_faces", "cull", "`front_faces='cull'`: must be one of cast, culled"),
+        ("depth_slices", -1, "`depth_slices` = -1: must be a whole number from 0 to 8,192"),
+        ("depth_slices", 2.5, "`depth_slices` = 2.5: must be"),
+    ],
+)
+def test_what_shadows_are_cast_with_is_checked(argument, value, message):
+    camera = a_camera(SMALL)
+    samples, casters = surface_samples(camera, 0), soup(camera, np.random.default_rng(0))
+    with pytest.raises(InputError, match=message):
+        cast_shadows("ptsv", ShadowPlan(), samples, casters, ShadowLight((0.0, 9.0, 0.0)), **{argument: value})
+
+
+@pytest.mark.parametrize("position", ["abc", None, (0.0, 1.0), (0.0, 1.0, np.nan), ((1.0,), 2.0, 3.0)])
+def test_a_light_without_a_place_is_refused(position):
+    with pytest.raises(InputError, match=r"`position_m` = .*: must be three finite numbers"):
+        ShadowLight(position)
+
+
+def test_a_light_is_refused_where_rounding_would_decide_more_than_the_bands_excuse():
+    """A large triangle and one that is a little wider than the bands, which is left out where it is seen too narrow."""
+    camera = a_camera(SMALL)
+    samples = surface_samples(camera, 0)
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 0.1], [0.20004, 0.2, 0.1], [0.2, 0.20004, 0.1]])
+    casters = Casters(corners, np.arange(6).reshape(2, 3))
+
+    def n_cast(distance_m: float, casters: Casters, directional: bool = False) -> int:
+        light = ShadowLight((0.1 * distance_m, 0.1 * distance_m, distance_m), directional)
+        return cast_shadows("ptsv", TILES, samples, casters, light).counts["casters"]
+
+    assert n_cast(1e5, casters) == 2
+    assert n_cast(1e6, casters, directional=True) == 2
+    far = ShadowLight((1e5, 1e5, 1e6))
+    unchecked = cast_by_bias("ptsv", TILES, samples, casters, far, 0, "cast", None, default_bias_m(casters))
+    assert unchecked.counts["casters"] == 1
+    for distance_m in (2e5, 1e30, 1e300):
+        with pytest.raises(
+            InputError, match=r"must be within 100000 of their extents, .*; make it a directional light"
+        ):
+            n_cast(distance_m, casters)
+    assert n_cast(1e30, Casters(np.zeros((0, 3)), np.zeros((0, 3), np.int32))) == 0

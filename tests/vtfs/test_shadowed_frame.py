@@ -96,6 +96,16 @@ def test_a_shadowed_image_is_the_sum_of_what_each_light_reaches():
     assert largest_relative_difference(unshadowed, expected, inputs.seen()) > 0.1
 
 
+def test_a_light_that_is_too_far_to_cast_is_refused_where_it_lights():
+    samples, lights = layered_samples(a_camera(), 3), nearby_lights(layered_samples(a_camera(), 3), 5, 3)
+    scene = ShadowScene(between(samples, lights, 3), NO_DIRECTIONAL, 1)
+    far = np.array([[0.0, 1e30, 0.0]])
+    with pytest.raises(InputError, match=r"`position_m` = \(0, 1e\+30, 0\): is 1e\+30 m from .*directional light"):
+        FrameShadows(scene, samples, point_lights(far, np.array([1e31]), np.full((1, 3), 1e60)))
+    # One that lights nothing casts on nothing, wherever it is.
+    assert len(FrameShadows(scene, samples, point_lights(far, np.ones(1), np.ones((1, 3)))).lights) == 1
+
+
 def test_a_technique_makes_the_image_that_the_references_make():
     inputs = a_frame(4, NO_DIRECTIONAL)
     image, expected = (render(c, inputs).astype(np.float64) for c in (CAST, configuration("brute_force")))

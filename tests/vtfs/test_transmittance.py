@@ -269,6 +269,16 @@ def test_bad_alpha_casters_are_refused_by_name(field, value, message):
         replace(good, **{field: value})
 
 
+def test_what_light_is_transmitted_by_is_checked():
+    samples, casters, light = conservatory()
+    with pytest.raises(InputError, match="`blending='x'`: must be one of grey, coloured, stochastic"):
+        transmitted_light("ptsv", ShadowPlan(), samples, casters, light, "x")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"`receives`: is bool of shape \(2, 2\)"):
+        transmitted_light("ptsv", ShadowPlan(), samples, casters, light, receives=np.ones((2, 2), bool))
+    with pytest.raises(InputError, match="make it a directional light"):
+        transmitted_light("ptsv", ShadowPlan(), samples, casters, ShadowLight((0.0, 1e9, 0.0)))
+
+
 def test_a_stencil_casts_no_alpha_shadows():
     samples, casters, light = conservatory()
     with pytest.raises(InputError, match="`z_fail`: casts no alpha shadows; use ptsv or cluster_hierarchy"):

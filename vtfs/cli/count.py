@@ -14,19 +14,24 @@ from vtfs.cli.options import (
     check_file,
     parsed_configuration,
     set_log_level,
+    split_names,
     write_json,
 )
 from vtfs.cli.scene_arguments import SceneArguments, with_scene
 from vtfs.cli.status import Status
 from vtfs.input_error import InputError
-from vtfs.parameters import TECHNIQUES
+from vtfs.parameters import TECHNIQUE_GROUPS, TECHNIQUES, named_techniques
 
 
 @with_scene
 def count(
     scene: SceneArguments,
     technique: Annotated[
-        str, typer.Option(help=f"One of {', '.join(TECHNIQUES)}; with --space several, comma-separated.")
+        str,
+        typer.Option(
+            help=f"One of {', '.join(TECHNIQUES)}; with --space several, comma-separated, or a group: "
+            f"{' or '.join(TECHNIQUE_GROUPS)}."
+        ),
     ] = "tiled_deferred",
     settings: SetOption = None,
     frame: Annotated[
@@ -41,21 +46,20 @@ def count(
 ) -> None:
     """Exact counts for every frame, or for every configuration of a space."""
     set_log_level(verbose)
-    names = tuple(dict.fromkeys(name.strip() for name in technique.split(","))) if space else (technique,)
-    for name in names[1:]:
-        parsed_configuration(name, settings)
-    config = parsed_configuration(names[0], settings)
+    if space and settings:
+        raise InputError(f"--set {settings[0]}: goes without --space, which has all values; list this one there.")
     if out and not space:
         raise InputError(
             "--out goes with --space: it is the table of a space's counts; use --json for one configuration."
         )
     if out:
         check_file("--out", out)
-    configs = (config,)
     if space:
         from tuning.space import load_space
 
-        configs = load_space(space, names).configurations()
+        configs = load_space(space, named_techniques(split_names(technique))).configurations()
+    else:
+        configs = (parsed_configuration(technique, settings),)
     setup = scene.set_up()
     frames = setup.chosen_frames(frame)
     from vtfs.count_table import count_frames, counts_csv, print_counts

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vtfs.parameters import PARAMETERS, TECHNIQUES
+from vtfs.parameters import PARAMETERS, TECHNIQUE_GROUPS, TECHNIQUES
 
 
 def scenes() -> None:
@@ -19,7 +19,7 @@ def scenes() -> None:
 
 
 def techniques() -> None:
-    """The techniques and their parameters."""
+    """The techniques, groups of them, and their parameters."""
     from rich.console import Console
     from rich.table import Table
 
@@ -27,6 +27,11 @@ def techniques() -> None:
     table = Table("technique", "parameters", box=None, pad_edge=False)
     for name, names in TECHNIQUES.items():
         table.add_row(name, ", ".join(names))
+    console.print(table)
+    table = Table("group", "techniques, wherever several can be named", box=None, pad_edge=False)
+    for name, members in TECHNIQUE_GROUPS.items():
+        table.add_row(name, ", ".join(members))
+    console.print()
     console.print(table)
     table = Table("parameter", "default", "values", "meaning", box=None, pad_edge=False)
     for parameter in PARAMETERS.values():

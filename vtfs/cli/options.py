@@ -42,6 +42,11 @@ def parsed_configuration(technique: str, settings: list[str] | None) -> Configur
     return configuration(technique, params)
 
 
+def split_names(given: str) -> tuple[str, ...]:
+    """A comma-separated list."""
+    return tuple(name.strip() for name in given.split(",") if name.strip())
+
+
 def check_file(option: str, file: Path) -> None:
     """Can it be written? Asked before the work is done, not after it."""
     if file.is_dir():

@@ -19,6 +19,7 @@ from vtfs.cli.options import (
 )
 from vtfs.cli.scene_arguments import SceneArguments, with_scene
 from vtfs.cli.status import Status
+from vtfs.parameters import SHADOW_REFERENCES
 
 
 @with_scene
@@ -34,7 +35,7 @@ def render(
     """Image, heat map of lighting computations, and the technique's cells as PNG.
 
     Of techniques with cells also: clusters in random colours, depth slices, and lights listed in vain. Of shadow
-    techniques also: the shadows, and the triangles that each pixel is tested against.
+    techniques also: the shadows, and the triangles or volume polygons that each pixel is tested against.
     """
     set_log_level(verbose)
     config = parsed_configuration(technique, settings)
@@ -79,17 +80,18 @@ def render(
                 ),
             }
         if shadows is not None:
-            most = int(shadows.tests.max(initial=0))
             pictures["shadow_mask"] = (
                 heat_map(shadows.stopped, len(inputs.shadows.lights), solid),
                 f"lights that shadows keep from each pixel: {shadows.share_stopped:.1%} of what they would light",
             )
-            if most:
-                mean = float(shadows.tests[solid].mean()) if solid.any() else 0.0
+            if config.technique not in SHADOW_REFERENCES:
+                # Also where nothing is tested: a picture of an earlier run would stay.
+                most = int(shadows.tests.max(initial=0))
+                in_the_mean = float(shadows.tests[solid].mean()) if solid.any() else 0.0
                 pictures["shadow_tests"] = (
                     heat_map(shadows.tests, most, solid),
-                    f"triangles that each pixel's tile or cluster is tested against: {mean:.1f} in the mean, at most "
-                    f"{most}",
+                    f"{shadows.tested} that each pixel's tile or cluster is tested against: {in_the_mean:.1f} in the "
+                    f"mean, at most {most}",
                 )
         paths = {kind: out / f"{_FILE_NAMES.get(kind, kind)}_{technique}_{number:04d}.png" for kind in pictures}
         for kind, (pixels, caption) in pictures.items():

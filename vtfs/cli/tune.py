@@ -10,18 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vtfs.cli.imported import recommend_imported
-from vtfs.cli.options import JsonOption, VerboseOption, check_folder, set_log_level, write_json
+from vtfs.cli.options import JsonOption, VerboseOption, check_folder, set_log_level, split_names, write_json
 from vtfs.cli.scene_arguments import SceneArguments, with_scene
 from vtfs.cli.status import Status
 from vtfs.input_error import InputError
-from vtfs.parameters import (
-    SHADOW_NAMES,
-    SHADOW_REFERENCES,
-    TECHNIQUES,
-    TUNED_TECHNIQUES,
-    casts_shadows,
-    configuration,
-)
+from vtfs.parameters import TUNED_TECHNIQUES, casts_shadows, named_techniques
 
 if TYPE_CHECKING:
     from reports.recommendation import Recommendation
@@ -34,8 +27,8 @@ def tune(
     techniques: Annotated[
         str | None,
         typer.Option(
-            help="Comma-separated, `all` many-light ones, or `shadows`; those that counting finds hopeless are not "
-            "measured.",
+            help="Comma-separated; `all` stands for the many-light ones, `shadows` for the shadow ones. Those that "
+            "counting finds hopeless are not measured, nor those of a group that cannot cast a scene's shadows.",
             metavar="A,B",
             show_default=", ".join(TUNED_TECHNIQUES),
         ),
@@ -71,7 +64,8 @@ def tune(
 ) -> None:
     """The main job: count, measure, model, search, report."""
     set_log_level(verbose)
-    names = _technique_names(techniques)
+    given = split_names(techniques) if techniques is not None else TUNED_TECHNIQUES
+    names = named_techniques(given)
     casts_shadows(names)  # refuses what cannot be compared
     if objective not in ("max", "mean"):
         raise InputError(f"--objective {objective}: must be max or mean.")
@@ -101,7 +95,7 @@ def tune(
     options = TuneOptions(
         out,
         names,
-        names if techniques and techniques.strip() not in _GROUPS else (),
+        tuple(name for name in names if name in given) if techniques else (),
         own_space,
         budget_parsed or DEFAULT_BUDGET,
         objective,
@@ -118,23 +112,6 @@ def tune(
     if json_file != "-":
         print(_recommendation(result, said))
         print(f"Report: {page}")
-
-
-_GROUPS = {
-    "all": tuple(name for name in TECHNIQUES if name not in SHADOW_NAMES),
-    "shadows": tuple(name for name in SHADOW_NAMES if name not in SHADOW_REFERENCES),
-}
-
-
-def _technique_names(given: str | None) -> tuple[str, ...]:
-    if given is None:
-        return TUNED_TECHNIQUES
-    if given.strip() in _GROUPS:
-        return _GROUPS[given.strip()]
-    names = tuple(dict.fromkeys(name.strip() for name in given.split(",") if name.strip()))
-    for name in names or ("",):
-        configuration(name)  # refuses what is unknown
-    return names
 
 
 def _command() -> str:
