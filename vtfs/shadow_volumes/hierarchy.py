@@ -148,12 +148,12 @@ def compact_table(
     lows, highs = (items.low_x_m, items.low_y_m, items.low_z_m), (items.high_x_m, items.high_y_m, items.high_z_m)
     # The greatest is minus the least of what is negated: all six at once.
     bounds = jnp.stack([*lows, *(-high for high in highs)], axis=1)
-    rows: list[Array] = []
+    of_levels: list[Array] = []
     for of_node in child:
         row = jnp.where(of_node[:, None] >= 0, bounds[jnp.maximum(of_node, 0)], jnp.inf).reshape(-1, branching, 6)
-        rows.insert(0, row.transpose(0, 2, 1))
+        of_levels.insert(0, row.transpose(0, 2, 1))
         bounds = jnp.min(row, axis=1)
-    rows = jnp.concatenate(rows).astype(jnp.float32)
+    rows = jnp.concatenate(of_levels).astype(jnp.float32)
     row, n_children = _padded(jnp.concatenate([rows[:, :3], -rows[:, 3:]], axis=1), is_frustum=False)
     n_below = jnp.concatenate([inner.n[-2::-1], leaf.n[:1]])
     by_node = jnp.concatenate([of_node.reshape(-1, branching) for of_node in reversed(child)])

@@ -104,7 +104,7 @@ def descend(at: AtLevel, first: int, last: int, volume: Volumes, hierarchy: Hier
         now = parent | (done.accepts > 0) | was
         cover = _for_each_child(at.cover[:n_parents], b) + done.accepts
         counts = _with_level(at.counts, lists, done, level, hierarchy, plan)
-        if slot is None:
+        if slot is None or of_slot is None:
             lists, own = done.lists.of_first(n_kept), jnp.asarray((*levels[1:], levels[-1] * b), jnp.int32)[level]
         else:
             lists, own = done.lists.at_slots(slot, of_slot), table.n_below[level]
