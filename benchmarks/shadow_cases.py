@@ -23,6 +23,9 @@ from vtfs.view_samples import ViewSamples, trace_view_samples
 
 LIGHT = ShadowLight((10.0, 30.0, -20.0))
 
+FULL_TREE_SLICES = 512
+"""Of a full tree at 1024 squared: one of cubic cells does not fit."""
+
 
 def clumps_scene(n_triangles: int, seed: int = 0) -> Scene:
     """Ground of 64 x 64 quads, and the rest small single triangles, normally distributed about 40 places above it."""

@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 from benchmarks.run_lines import RunLines, side_by_side, why
-from benchmarks.shadow_cases import Case, named_case, run_alone, scene_arguments, with_room
+from benchmarks.shadow_cases import FULL_TREE_SLICES, Case, named_case, run_alone, scene_arguments, with_room
 from vtfs.device import device_name, keep_compiled_programs
 from vtfs.files import write_atomically
 from vtfs.shadow_casters import FrontFaces
@@ -36,8 +36,6 @@ SILHOUETTE, NO_PLANES = replace(PAPER, extra="silhouette"), replace(PAPER, extra
 IMPLICIT, FEEDBACK = replace(PAPER, bounds="implicit"), replace(PAPER, feedback=True)
 TWO_PASSES, FULL = replace(PAPER, passes=2), replace(PAPER, tree="full")
 LARGE_TILES = replace(PAPER, tile_px=16)
-FULL_TREE_SLICES = 512
-"""Of the full tree at 1024 squared: one of cubic cells does not fit."""
 
 
 @dataclass(frozen=True)

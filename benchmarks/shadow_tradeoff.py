@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 from benchmarks.run_lines import RunLines, side_by_side, why
-from benchmarks.shadow_cases import Case, named_case, run_alone, scene_arguments, with_room
+from benchmarks.shadow_cases import FULL_TREE_SLICES, Case, named_case, run_alone, scene_arguments, with_room
 from benchmarks.shadows import embree, times_ms
 from vtfs.device import device_name, keep_compiled_programs, versions
 from vtfs.gbuffer import from_runs
@@ -34,7 +34,6 @@ from vtfs.shadow_techniques import fitted_to_all, shadow_counts, shadow_grid, sh
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
 
 BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (4, 16, 2, 32)
-FULL_TREE_SLICES = 512
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,7 @@ class NodeLists(eqx.Module):
         """The node of each group; of one that is not used any node."""
         if self.node is not None:
             return self.node
-        group = jnp.arange(self.triangle.shape[0], dtype=jnp.int32)
-        return jnp.minimum(last_not_above(self.start, group), self.count.shape[0] - 1)
+        return owners(self.start, self.n_groups, self.triangle.shape[0])
 
     def of_first(self, n: int) -> NodeLists:
         """Without the nodes from the `n`-th on, whose lists are empty."""
@@ -88,7 +87,9 @@ def owners(start: Int[Array, " nodes_and_1"], n_groups: Int[Array, ""], capacity
     if width == capacity:
         _, node = find(state)
     else:
-        _, node = jax.lax.while_loop(lambda state: state[0] < n_groups, find, state)
+        # Of lists that overflow, which are thrown away, no more than there is room for.
+        used = jnp.minimum(n_groups, capacity)
+        _, node = jax.lax.while_loop(lambda state: state[0] < used, find, state)
     return jnp.minimum(node[:capacity], last)
 
 

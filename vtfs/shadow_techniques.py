@@ -216,14 +216,16 @@ def fitted_to_all(
     )
     if technique == "cluster_hierarchy" and plan.tree == "compact":
         plan = replace(plan, nodes=plan.nodes or _rounded_up("nodes", plan.clusters // min(2 * plan.branching, 32), 64))
+
+    def most(name: str) -> int:
+        return max(int(getattr(mask.counts, name)) for mask in masks)
+
     while True:
         masks = [run(plan, i) for i in range(len(frames))]
         needed = np.max([np.asarray(mask.counts.groups) for mask in masks], axis=0).astype(np.int64)
         if not any(bool(mask.overflowed) for mask in masks):
             break
-        n_blocks = max(int(mask.counts.n_blocks) for mask in masks)
-        n_pairs = max(int(mask.counts.n_pairs) for mask in masks)
-        n_nodes = max(int(mask.counts.n_nodes) for mask in masks)
+        n_blocks, n_nodes, n_pairs = (most(name) for name in ("n_blocks", "n_nodes", "n_pairs"))
         grown = replace(plan, clusters=_rounded_up("clusters", n_blocks, plan.clusters))
         if n_blocks <= plan.clusters:  # else the nodes are meaningless
             grown = replace(grown, nodes=_rounded_up("nodes", n_nodes, plan.nodes))
@@ -239,11 +241,7 @@ def fitted_to_all(
             raise InputError(f"{technique}: the frame fits no capacity; use larger tiles or a batch.")
         plan = grown
     if jax.default_backend() != "cpu" if unrolled is None else unrolled:
-        n_blocks, n_nodes = (
-            max(int(n) for n in of_masks)
-            for of_masks in ([m.counts.n_blocks for m in masks], [m.counts.n_nodes for m in masks])
-        )
-        plan = _unrolled(plan, needed, n_blocks, n_nodes)
+        plan = _unrolled(plan, needed, most("n_blocks"), most("n_nodes"))
     return plan, masks
 
 

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests.strategies import seeds
-from vtfs.node_lists import NodeLists, grouped, one_list, pairs_of, split, split_at_once
+from vtfs.node_lists import NodeLists, grouped, one_list, owners, pairs_of, split, split_at_once
 
 N_TRIANGLES, N_NODES, BRANCHING, LANES = 100, 5, 4, 8
 CAPACITY_IN = 70
@@ -125,3 +125,11 @@ def test_lists_survive_being_pairs(seed, share):
     assert (np.asarray(back.count) == np.asarray(expected.count)).all()
     assert (np.asarray(back.start) == np.asarray(expected.start)).all()
     assert (np.asarray(back.triangle) == np.asarray(expected.triangle)).all()
+
+
+def test_the_nodes_of_lists_that_overflow_are_found_for_as_many_groups_as_there_is_room():
+    # Saturated, as `group_starts` leaves it: a loop over all of them would take minutes.
+    start = jnp.array([0, 3, 3, 2**30], jnp.int32)
+    node = owners(start, jnp.int32(2**30), 2**14 + 5)
+    assert node.shape == (2**14 + 5,)
+    assert node[:4].tolist() == [0, 0, 0, 2] and (node[3 : 2**13] == 2).all()

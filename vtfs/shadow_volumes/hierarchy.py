@@ -183,6 +183,9 @@ def _parents(key: Int[Array, " keys"], n_keys: Int[Array, ""], capacities: tuple
     before = jnp.pad(of_level[:, :-1], ((0, 0), (1, 0)), constant_values=-1)
     first = (of_level != before) & exists
     ids = jnp.where(exists, jnp.cumsum(first, axis=1, dtype=jnp.int32) - 1, n)
+    n_of_level = jnp.sum(first, axis=1, dtype=jnp.int32)
+    if not n_levels:
+        return _Parents([ids[0]], n_of_level, [], [])
     own, parent = ids[:-1], ids[1:]
     widths = np.array((n, *capacities[:-1]))
     fits = first[:-1] & (parent < np.array(capacities)[:, None]) & (own < widths[:, None])
@@ -196,10 +199,8 @@ def _parents(key: Int[Array, " keys"], n_keys: Int[Array, ""], capacities: tuple
         flat = jnp.full(size, absent, jnp.int32).at[place.reshape(-1)].set(values.reshape(-1), mode="drop")
         return [flat[start:end] for start, end in zip(starts, ends, strict=True)]
 
-    if not n_levels:
-        return _Parents([ids[0]], jnp.sum(first, axis=1, dtype=jnp.int32), [], [])
     child, slots = scattered(slot, ends, own, -1), scattered(own, node_ends, slot, NO_SLOT)
-    return _Parents(list(ids), jnp.sum(first, axis=1, dtype=jnp.int32), child, slots)
+    return _Parents(list(ids), n_of_level, child, slots)
 
 
 def merged_up(shadowed: Bool[Array, " places"], table: NodeTable) -> Bool[Array, " places"]:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
-from vtfs.bit_lists import last_not_above, pack_bits
+from vtfs.bit_lists import pack_bits
 from vtfs.node_lists import NodeLists, owners
 from vtfs.shadow_mask import ShadowPlan
 from vtfs.shadow_volumes.hierarchy import Hierarchy
@@ -101,7 +101,7 @@ def _merged(bits: UInt32[Array, "groups words"], lists: NodeLists, n_items: int)
     bits = bits[:capacity]
     longest = jnp.max(start[1:] - start[:-1])
     group = jnp.arange(capacity, dtype=jnp.int32)
-    end = start[(owners(start, lists.n_groups, capacity) if lists.node is None else lists.node) + 1]
+    end = start[lists.nodes() + 1]
 
     def double(bits, step):
         other = group + step
@@ -136,7 +136,7 @@ def held_counts(
     n_padded = -(-capacity // chunk) * chunk
     triangle = jnp.pad(lists.triangle, ((0, n_padded - capacity), (0, 0)), constant_values=n_triangles)
     n_groups = jnp.minimum(lists.n_groups, capacity)
-    item_of_group = jnp.minimum(last_not_above(lists.start, jnp.arange(n_padded, dtype=jnp.int32)), n_items - 1)
+    item_of_group = jnp.minimum(owners(lists.start, n_groups, n_padded), n_items - 1)
     rows = jnp.stack([samples.x_m, samples.y_m, samples.z_m], axis=1)
 
     def test(state):

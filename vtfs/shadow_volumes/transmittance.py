@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from vtfs.alpha_casters import LARGEST_ALPHA, AlphaSurfaces, Blending
-from vtfs.bit_lists import last_not_above
+from vtfs.node_lists import owners
 from vtfs.random_words import random_words
 from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
 from vtfs.shadow_volumes import cluster_hierarchy, ptsv
@@ -76,7 +76,7 @@ def transmit(
     n_padded = -(-capacity // chunk) * chunk
     triangle = jnp.pad(lists.triangle, ((0, n_padded - capacity), (0, 0)))
     n_groups = jnp.minimum(lists.n_groups, capacity)
-    item_of_group = jnp.minimum(last_not_above(lists.start, jnp.arange(n_padded, dtype=jnp.int32)), n_items - 1)
+    item_of_group = jnp.minimum(owners(lists.start, n_groups, n_padded), n_items - 1)
     rows, pixel = sample_rows(hierarchy, volume), _pixels(samples)
 
     def loop(state):
