@@ -1,15 +1,16 @@
 """Shadow masks against branching 2 to 64 and tiles of 2 to 32 pixels: time, tests and masks, on several scenes.
 
 python -m benchmarks.shadow_tradeoff SCENE[,SCENE...] --out DIR [--scenes FOLDER] [--triangles 60000] [--size 1024]
-    [--along 0] [--minutes 8] [--workers 1] [--only branching|tile_8|tile_32|trees]
+    [--along 0] [--minutes 8] [--workers 1] [--only branching|tile_8|tile_32|trees] [--only-sizes]
 
 SCENE is `clumps`, a built-in name, or FOLDER/SCENE.glb with SCENE.cameras.json beside it. Branching at tiles of 8,
 tiles at 8 and at 32 children; and at 32 children, without feedback as in the paper, the full tree beside the compact
 one (both with 512 slices, as cubic cells are too many) and two passes from either level. Each program runs from view
 samples to mask, capacities known. Programs are compiled side by side for four fifths of the time; then, with nothing
 beside, all are timed in turns, twice. A line of DIR/shadow-tradeoff-cpu.jsonl (or gpu) is a configuration; what is
-there, on this device and at this size, is not run again. Tables and charts of it: `python -m
-benchmarks.shadow_tradeoff_charts`.
+there, on this device and at this size, is not run again. Capacities and counts, which no device changes, are lines of
+DIR/shadow-sizes.jsonl: with that of another device, and `--only-sizes` makes no more than it, half as much is compiled.
+Tables and charts: `python -m benchmarks.shadow_tradeoff_charts`.
 """
 
 from __future__ import annotations
@@ -29,8 +30,15 @@ from benchmarks.shadows import embree, times_ms
 from vtfs.device import device_name, keep_compiled_programs, versions
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
-from vtfs.shadow_mask import CastersOnDevice, ShadowFrame, ShadowMask, ShadowPlan, casters_on_device, shadow_frame
-from vtfs.shadow_techniques import fitted_to_all, shadow_counts, shadow_grid, shadow_program
+from vtfs.shadow_mask import CastersOnDevice, ShadowFrame, ShadowPlan, casters_on_device, shadow_frame
+from vtfs.shadow_techniques import (
+    fitted_to_all,
+    shadow_counts,
+    shadow_grid,
+    shadow_program,
+    shadow_sizes,
+    with_shadow_sizes,
+)
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
 
 BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (4, 16, 2, 32)
@@ -104,28 +112,51 @@ class Ready:
     frame: ShadowFrame
     depth_slices: int
     plan: ShadowPlan
-    sized: ShadowMask
+    counts: dict
     program: Any
     seconds: float
 
 
-def prepare(key: str, subject: Subject, variant: Variant, one_at_once: threading.Lock) -> Ready:
-    """Size and compile; `one_at_once` holds what runs on the device."""
-    started, case, plan = time.monotonic(), subject.case, variant.plan
-    depth_slices = variant.depth_slices
+def frame_of(subject: Subject, variant: Variant) -> tuple[ShadowFrame, int]:
+    """The view for a variant, and its slices; 0: cubic cells."""
+    case, tile_px, depth_slices = subject.case, variant.plan.tile_px, variant.depth_slices
     try:
-        grid = shadow_grid(case.samples, plan.tile_px, depth_slices)
+        grid = shadow_grid(case.samples, tile_px, depth_slices)
     except InputError:  # cubic cells as narrow as such tiles are more than keys can tell apart
         depth_slices = 2**KEY_BITS
-        grid = shadow_grid(case.samples, plan.tile_px, depth_slices)
+        grid = shadow_grid(case.samples, tile_px, depth_slices)
     frame = shadow_frame(case.samples, subject.casters, case.light, grid, case.bias_m, case.receives)
-    plan = with_room(plan, case.casters.n_triangles)
+    return frame, depth_slices
 
+
+def sizes_of(subject: Subject, variant: Variant, frame: ShadowFrame, one_at_once: threading.Lock) -> dict:
+    """Capacities that hold the view, with loops and without, and counts; `one_at_once` holds what runs."""
+    plan = with_room(variant.plan, subject.case.casters.n_triangles)
     run = run_alone(variant.technique, frame, one_at_once)
-    plan, (sized,) = fitted_to_all(variant.technique, plan, [frame], run=run)
+    looped, (sized,) = fitted_to_all(variant.technique, plan, [frame], False, run)
+    unrolled, _ = fitted_to_all(variant.technique, looped, [frame], True, lambda *_: sized)
+    plans = {"looped": shadow_sizes(looped), "unrolled": shadow_sizes(unrolled)}
+    return plans | {"counts": shadow_counts(sized, frame, looped)}
+
+
+def prepare(
+    key: str, subject: Subject, variant: Variant, sizes: RunLines, only_sizes: bool, one_at_once: threading.Lock
+) -> Ready | None:
+    """Size and compile."""
+    started = time.monotonic()
+    frame, depth_slices = frame_of(subject, variant)
+    size_key = f"{subject.case.name}: {variant.name}"
+    found = sizes.known().get(size_key)
+    if found is None:
+        found = {"key": size_key, "sized_on": device_name(), **sizes_of(subject, variant, frame, one_at_once)}
+        sizes.add(found)
+    if only_sizes:
+        return None
+    plan = with_shadow_sizes(variant.plan, tuple(found["looped" if jax.default_backend() == "cpu" else "unrolled"]))
     with jax.enable_x64(True):
         program = shadow_program(variant.technique, plan).lower(frame).compile()
-    return Ready(key, subject, variant, frame, depth_slices, plan, sized, program, time.monotonic() - started)
+    seconds = time.monotonic() - started
+    return Ready(key, subject, variant, frame, depth_slices, plan, found["counts"], program, seconds)
 
 
 def line_of(ready: Ready, times: list[float], mask: np.ndarray, first: np.ndarray) -> dict:
@@ -151,7 +182,7 @@ def line_of(ready: Ready, times: list[float], mask: np.ndarray, first: np.ndarra
         "shadowed": int(mask.sum()),
         "differs_from_first": int((mask != first).sum()),
         "differs_from_rays": int((mask != ready.subject.by_rays).sum()),
-        "counts": shadow_counts(ready.sized, ready.frame, ready.plan),
+        "counts": ready.counts,
     }
 
 
@@ -168,7 +199,9 @@ def time_all(ready: list[Ready], seconds: float, lines: RunLines) -> None:
             except Exception as error:  # one that fails is a line too, and the others go on
                 lines.add({"key": one.key, "failed": why(error)})
                 continue
-            assert not bool(overflowed)
+            if bool(overflowed):
+                lines.add({"key": one.key, "failed": "does not fit the capacities of DIR/shadow-sizes.jsonl"})
+                continue
             if turn == 0:
                 continue
             case = one.subject.case
@@ -187,12 +220,13 @@ def main() -> None:
     parser = scene_arguments(__doc__, minutes=8.0)
     parser.add_argument("--along", type=float, default=0.0)
     parser.add_argument("--only", choices=list(GROUPED))
+    parser.add_argument("--only-sizes", action="store_true")
     given = parser.parse_args()
     started = time.monotonic()
     end = started + 60 * given.minutes
     keep_compiled_programs()
     backend = "cpu" if jax.default_backend() == "cpu" else "gpu"
-    lines = RunLines(given.out / f"shadow-tradeoff-{backend}.jsonl")
+    lines, sizes = RunLines(given.out / f"shadow-tradeoff-{backend}.jsonl"), RunLines(given.out / "shadow-sizes.jsonl")
     subjects = []
     for name in given.scene.split(","):
         case = named_case(name, given.scenes, given.triangles, given.along, given.size)
@@ -214,7 +248,9 @@ def main() -> None:
 
     def compile_one(task: tuple[str, Subject, Variant]) -> None:
         try:
-            ready.append(prepare(*task, one_at_once))
+            one = prepare(*task, sizes, given.only_sizes, one_at_once)
+            if one:
+                ready.append(one)
         except Exception as error:  # one that fails is a line too, and the others go on
             lines.add({"key": task[0], "failed": why(error)})
             print(f"{task[0]}: failed: {why(error)}", flush=True)

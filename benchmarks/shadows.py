@@ -1,13 +1,13 @@
 """Shadow techniques against branching, tile size and Embree: time, tests and errors of every variant.
 
 python -m benchmarks.shadows --out DIR [--scene clumps|BUILT_IN|FILE] [--triangles 60000]
-    [--cameras FILE] [--along 0] [--size 1024] [--minutes 8] [--variants cross|all|quick] [--workers 1]
+    [--cameras FILE] [--along 0] [--size 1024] [--minutes 8] [--variants cross|all|quick] [--workers 1] [--kernels]
 
 One process; `workers` threads compile. With warp-lang 1.19 installed and a GPU, its shadow rays run beside. A
 configuration that fails, or for which no time is left, is a line of the table too. Each program runs
 from view samples to mask: clusters, hierarchy, planes, walk and merge; vertices, triangles and samples are on the
 device, nothing else is made before. Errors are samples outside the bands of `shadow_references.classify`, on at most
-2,000 samples drawn at random and on all that differ from Embree.
+2,000 samples drawn at random and on all that differ from Embree. `--kernels` also says where each one's time goes.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from benchmarks.kernels import Kernels, kernels_of, table
 from benchmarks.shadow_cases import Case, read_case
 from vtfs.device import device_name, keep_compiled_programs, versions
 from vtfs.files import write_atomically
@@ -40,12 +41,13 @@ BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (8, 16, 4, 32, 2)
 def variants(which: str) -> Iterator[tuple[str, ShadowPlan]]:
     """The most telling first: what comes late may find no time left."""
     yield "cluster_hierarchy", ShadowPlan(8, 8)
-    yield "cluster_hierarchy", ShadowPlan(8, 16)
     yield "ptsv", ShadowPlan(8, 8, extra="silhouette")
-    if which == "quick":
-        return
+    yield "cluster_hierarchy", ShadowPlan(8, 16)
+    yield "ptsv", ShadowPlan(8, 16, extra="silhouette")
     yield "cluster_hierarchy", ShadowPlan(8, 32)
     yield "ptsv", ShadowPlan(8, 32, extra="silhouette")
+    if which == "quick":
+        return
     yield "cluster_hierarchy", ShadowPlan(8, 8, extra="off")
     yield "cluster_hierarchy", ShadowPlan(8, 8, feedback=False)
     yield "cluster_hierarchy", ShadowPlan(8, 8, bounds="implicit")
@@ -97,13 +99,12 @@ def prepare(case: Case, casters: CastersOnDevice, technique: str, plan: ShadowPl
     plan = fitted(technique, plan, frame)
     counted = run_program(technique, plan, frame)
     with jax.enable_x64(True):
-        program = shadow_program(technique, plan)
-        jax.block_until_ready(program(frame))
+        program = shadow_program(technique, plan).lower(frame).compile()
     return Prepared(plan, frame, counted, program, time.perf_counter() - started)
 
 
-def measure(case: Case, ready: Prepared, by_rays: np.ndarray) -> dict:
-    """Time, counts and errors of one configuration."""
+def measure(case: Case, ready: Prepared, by_rays: np.ndarray, with_kernels: bool) -> dict:
+    """Time, counts and errors of one configuration; and where its time goes."""
     with jax.enable_x64(True):
         shadowed, overflowed = jax.block_until_ready(ready.program(ready.frame))
         times = times_ms(lambda: ready.program(ready.frame))
@@ -128,7 +129,13 @@ def measure(case: Case, ready: Prepared, by_rays: np.ndarray) -> dict:
         "errors": found.errors,
         "counts": shadow_counts(ready.counted, ready.frame, ready.plan),
         "capacities": asdict(ready.plan),
+        **({"kernels": asdict(_kernels(ready))} if with_kernels else {}),
     }
+
+
+def _kernels(ready: Prepared) -> Kernels:
+    with jax.enable_x64(True):
+        return kernels_of(ready.program, lambda: ready.program(ready.frame))
 
 
 def main() -> None:
@@ -142,6 +149,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=8.0)
     parser.add_argument("--variants", choices=("cross", "all", "quick"), default="cross")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--kernels", action="store_true")
     arguments = parser.parse_args()
     end = time.monotonic() + 60 * arguments.minutes
     keep_compiled_programs()
@@ -180,7 +188,7 @@ def main() -> None:
             print(f"{head}no time left", flush=True)
         else:
             try:
-                result |= measure(case, job.result(), by_rays)
+                result |= measure(case, job.result(), by_rays, arguments.kernels)
                 counts = result["counts"]
                 print(
                     f"{head}{result['time_ms']:>9.2f}{counts['test_and_set'] / 1e6:>9.2f}"
@@ -188,6 +196,8 @@ def main() -> None:
                     f"{result['errors']:>7}{result['near_edge'] + result['near_plane']:>6}",
                     flush=True,
                 )
+                if arguments.kernels:
+                    print(table(Kernels(**result["kernels"])), flush=True)
             except Exception as error:  # a configuration that fails is a result
                 result |= {
                     "outcome": "failed",
