@@ -13,7 +13,11 @@ from typing import Any
 import jax
 
 _TABLE_ROW = re.compile(r'^(\d+) (?:"(.*)"|\{(.*)\})$')
+_NUMBERS = re.compile(r"([._-]\d+)+$")
 _INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%?([\w.-]+) = .*stack_frame_id=(\d+)")
+
+_CALLERS = ("while", "conditional", "call")
+"""Of which a CPU's profile holds what they call as well."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,8 @@ class Kernels:
 
 
 def asked_by(hlo: str) -> dict[str, str]:
-    """The function, as file:name, that asked for each instruction of an optimised program's text."""
+    """The function, as file:name, that asked for each instruction of an optimised program's text; by the name of its
+    kernel."""
     tables: dict[str, dict[str, Any]] = {}
     table: dict[str, Any] = {}
     found: dict[str, str] = {}
@@ -40,8 +45,12 @@ def asked_by(hlo: str) -> dict[str, str]:
             name, frame = instruction.groups()
             at = tables["FileLocations"][tables["StackFrames"][frame]["file_location_id"]]
             file = Path(tables["FileNames"][at["file_name_id"]]).stem
-            found[name] = f"{file}:{tables['FunctionNames'][at['function_name_id']].split('.')[-1]}"
+            found[_kernel(name)] = f"{file}:{tables['FunctionNames'][at['function_name_id']].split('.')[-1]}"
     return found
+
+
+def _kernel(instruction: str) -> str:
+    return re.sub(r"[.-]", "_", instruction)
 
 
 def kernels_of(compiled: Any, call: Callable[[], Any], n_calls: int = 10) -> Kernels:
@@ -63,8 +72,10 @@ def kernels_of(compiled: Any, call: Callable[[], Any], n_calls: int = 10) -> Ker
                 continue
             for event in line.events:
                 op = dict(event.stats).get("hlo_op")
-                if op is not None:
-                    function = functions.get(str(op), "unknown")
+                if op is not None and not str(op).startswith(_CALLERS):
+                    # In a CUDA graph all kernels are of one instruction, and only their own names tell them apart.
+                    known = (functions.get(_kernel(name)) for name in (event.name, str(op)))
+                    function = next(filter(None, known), "kernel " + _NUMBERS.sub("", event.name))
                     ns[function] += event.duration_ns
                     launches[function] += 1
     by_function = {name: (total / n_calls / 1e6, launches[name] / n_calls) for name, total in ns.most_common()}

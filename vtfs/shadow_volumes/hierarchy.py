@@ -152,7 +152,8 @@ def compact_table(
     for of_node in child:
         row = jnp.where(of_node[:, None] >= 0, bounds[jnp.maximum(of_node, 0)], jnp.inf).reshape(-1, branching, 6)
         of_levels.insert(0, row.transpose(0, 2, 1))
-        bounds = jnp.min(row, axis=1)
+        # Else XLA for GPUs makes one kernel of all levels, in which each node bounds all that lies below it again.
+        bounds = jax.lax.optimization_barrier(jnp.min(row, axis=1))
     rows = jnp.concatenate(of_levels).astype(jnp.float32)
     row, n_children = _padded(jnp.concatenate([rows[:, :3], -rows[:, 3:]], axis=1), is_frustum=False)
     n_below = jnp.concatenate([inner.n[-2::-1], leaf.n[:1]])
