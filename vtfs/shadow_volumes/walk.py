@@ -174,17 +174,17 @@ def _with_samples(walk: Walk, at: AtLevel, volume: Volumes, hierarchy: Hierarchy
         walk,
         (walk.counts.plus(at.counts), walk.overflowed | too_many(at.counts.groups, plan)),
     )
-    walk = jax.lax.cond(hierarchy.counted, lambda: _with_sample_tests(walk, at, hierarchy, plan), lambda: walk)
+    walk = jax.lax.cond(hierarchy.counted, lambda: _with_sample_tests(walk, at, hierarchy, plan.feedback), lambda: walk)
     return eqx.tree_at(lambda walk: walk.shadowed, walk, shadowed)
 
 
-def _with_sample_tests(walk: Walk, at: AtLevel, hierarchy: Hierarchy, plan: ShadowPlan) -> Walk:
-    """The walk with the counts of such samples' tests; `walk.shadowed` by earlier batches."""
+def _with_sample_tests(walk: Walk, at: AtLevel, hierarchy: Hierarchy, feedback: bool) -> Walk:
+    """The walk with the counts of such samples' tests; with `feedback` without those shadowed by earlier batches."""
     n_items = hierarchy.tile_of_item.shape[0]
     length = at.lists.count[:n_items]
-    done = n_bits_set(walk.shadowed).sum(axis=1, dtype=jnp.int32) if plan.feedback else jnp.zeros_like(length)
+    done = n_bits_set(walk.shadowed).sum(axis=1, dtype=jnp.int32) if feedback else jnp.zeros_like(length)
     tested = hierarchy.n_in_tile - done
-    known = bits_of_samples(walk.shadowed, hierarchy) & plan.feedback
+    known = bits_of_samples(walk.shadowed, hierarchy) & feedback
     own_length = length[jnp.clip(hierarchy.item_of_sample, 0, n_items - 1)]
     is_used = jnp.arange(at.lists.triangle.shape[0], dtype=jnp.int32) < at.lists.n_groups
     each = jnp.where(is_used, tested[jnp.minimum(at.lists.nodes(), n_items - 1)], 0)
@@ -258,15 +258,4 @@ def to_items(volume: Volumes, hierarchy: Hierarchy, plan: ShadowPlan) -> tuple[A
         _no_walk(volume, hierarchy),
         (at.counts, too_many(at.counts.groups, plan)),
     )
-
-    def with_sample_tests() -> Walk:
-        n_items = hierarchy.tile_of_item.shape[0]
-        length = at.lists.count[:n_items]
-        own_length = length[jnp.clip(hierarchy.item_of_sample, 0, n_items - 1)]
-        tests = jnp.where(hierarchy.samples.receives, own_length, 0)
-        sample_tests = jnp.sum(length.astype(jnp.int64) * hierarchy.n_in_tile)
-        return eqx.tree_at(
-            lambda walk: (walk.list_length, walk.tests, walk.sample_tests), walk, (length, tests, sample_tests)
-        )
-
-    return at, jax.lax.cond(hierarchy.counted, with_sample_tests, lambda: walk)
+    return at, jax.lax.cond(hierarchy.counted, lambda: _with_sample_tests(walk, at, hierarchy, False), lambda: walk)
