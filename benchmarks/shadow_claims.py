@@ -1,19 +1,21 @@
 """What the papers of 2011 and 2014 say of their shadow algorithms, counted again.
 
 python -m benchmarks.shadow_claims SCENE[,SCENE...] --out DIR [--scenes FOLDER] [--triangles 60000] [--frames 8]
-    [--size 1024] [--large 4096] [--minutes 20] [--workers 1]
+    [--size 1024] [--large 4096] [--minutes 20] [--workers 1] [--times]
 
 SCENE is a built-in name, or FOLDER/SCENE.glb with SCENE.cameras.json beside it. Counts alone: they are the same on
-every device. Growth is from `size` to `large`; the papers' is from 1024 to 4096 squared, 16 times the samples. Tiles of
-8 pixels and 32 children, as the papers; the stencil's own counts do not depend on tiles, which are of 16 at `large`.
-Frames lie evenly on the path; all but the last claim are of the first one. A count is a line of
-DIR/shadow-claims-SCENE-SIZE.jsonl, written as it is known and not counted again by the next call; one that failed says
-why. DIR/shadow-claims-SCENE-SIZE.md is the table of what is known.
+every device; `--times` is of clusters on the frames of the path alone, one program for all, in turns. Growth is from
+`size` to `large`; the papers' is from 1024 to 4096 squared, 16 times the samples. Tiles of 8 pixels and 32 children, as
+the papers; the stencil's own counts do not depend on tiles, which are of 16 at `large`. Frames lie evenly on the path;
+all but the last claims are of the first one. A count is a line of DIR/shadow-claims-SCENE-SIZE.jsonl, written as it is
+known and not counted again by the next call; one that failed says why. DIR/shadow-claims-SCENE-SIZE.md is the table of
+what is known.
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
 import os
 import threading
 import time
@@ -25,17 +27,20 @@ import numpy as np
 
 from benchmarks.run_lines import RunLines, side_by_side, why
 from benchmarks.shadow_cases import FULL_TREE_SLICES, Case, named_case, run_alone, scene_arguments, with_room
+from benchmarks.shadows import times_ms
 from vtfs.device import device_name, keep_compiled_programs
 from vtfs.files import write_atomically
 from vtfs.shadow_casters import FrontFaces
 from vtfs.shadow_mask import ShadowPlan, casters_on_device, shadow_frame
-from vtfs.shadow_techniques import fitted_to_all, shadow_counts, shadow_grid
+from vtfs.shadow_techniques import fitted_to_all, shadow_counts, shadow_grid, shadow_program
 
 PAPER = ShadowPlan(tile_px=8, branching=32, feedback=False)
 SILHOUETTE, NO_PLANES = replace(PAPER, extra="silhouette"), replace(PAPER, extra="off")
 IMPLICIT, FEEDBACK = replace(PAPER, bounds="implicit"), replace(PAPER, feedback=True)
 TWO_PASSES, FULL = replace(PAPER, passes=2), replace(PAPER, tree="full")
 LARGE_TILES = replace(PAPER, tile_px=16)
+
+TIMED = {"32 children, no feedback": PAPER, "our defaults": ShadowPlan()}
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,7 @@ class Run:
 
     @property
     def key(self) -> str:
-        default = ShadowPlan()
+        default = FEEDBACK
         plan = [f"{k}={v}" for k, v in vars(self.plan).items() if v != getattr(default, k)]
         culled = ["culled"] if self.front_faces == "culled" else []
         slices = [f"{self.depth_slices} slices"] if self.depth_slices else []
@@ -150,7 +155,32 @@ def table(scene: str, known: Mapping[Hashable, dict], n_frames: int, failed: dic
         text = f"clusters: frame with most tests over the median, {len(of_frames)} frames (time up to 7)"
         each = f"{max(of_frames):,}, {np.median(of_frames):,.0f}"
         rows.append(f"| {text} | 1 to 7 | {value:,.2f} | {each} | {'agrees' if value <= 7 else 'differs'} |")
+    rows += [_row_of_times(line) for key, line in known.items() if str(key).startswith("times ")]
     return "\n".join(rows) + "\n"
+
+
+def _row_of_times(line: dict) -> str:
+    lowest = [float(np.percentile(ms, 10)) for ms in line["times_ms"]]
+    most, middle = max(lowest), float(np.median(lowest))
+    text = f"clusters: slowest frame over the median, {line['plan']}, {len(lowest)} frames, {line['device']}"
+    agrees = "agrees" if most / middle <= 7 else "differs"
+    return f"| {text} | 1 to 7 | {most / middle:,.2f} | {most:.1f}, {middle:.1f} ms | {agrees} |"
+
+
+def path_times_ms(plan: ShadowPlan, cases: list[Case], turns: int = 5) -> list[list[float]]:
+    """Times of each frame, from view samples to mask: one program, with capacities that hold all of them, in turns."""
+    casters = casters_on_device(cases[0].casters)
+    frames = [
+        shadow_frame(one.samples, casters, one.light, shadow_grid(one.samples, plan.tile_px), one.bias_m, one.receives)
+        for one in cases
+    ]
+    plan, _ = fitted_to_all("cluster_hierarchy", with_room(plan, cases[0].casters.n_triangles), frames)
+    times: list[list[float]] = [[] for _ in frames]
+    with jax.enable_x64(True):
+        program = shadow_program("cluster_hierarchy", plan).lower(frames[0]).compile()
+        for _, (own, frame) in itertools.product(range(turns), enumerate(frames)):
+            times[own] += times_ms(lambda frame=frame: program(frame), 0.2, fewest=2)
+    return times
 
 
 def _range(claim: Claim) -> str:
@@ -166,6 +196,7 @@ def main() -> None:
     parser = scene_arguments(__doc__, minutes=20.0)
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--large", type=int, default=4096)
+    parser.add_argument("--times", action="store_true")
     given = parser.parse_args()
     end = time.monotonic() + 60 * given.minutes
     keep_compiled_programs()
@@ -204,7 +235,18 @@ def main() -> None:
         lines[scene].add(line)
         print(f"{scene}: {run.key}: {found}", flush=True)
 
-    side_by_side(tasks, given.workers, end, count)
+    def time_path(scene: str) -> None:
+        for name, plan in TIMED.items():
+            key = f"times {name} {given.frames} {device_name()}"
+            if key not in known[scene]:
+                times = path_times_ms(plan, [case_of(scene, run.case) for run in path_runs(given.frames)])
+                lines[scene].add({"key": key, "plan": name, "device": device_name(), "times_ms": times})
+
+    if given.times:
+        for scene in scenes:
+            time_path(scene)
+    else:
+        side_by_side(tasks, given.workers, end, count)
     for scene in scenes:
         failed = {line["key"]: line["failed"] for line in lines[scene].lines if "failed" in line}
         text = table(scene, lines[scene].known(), given.frames, failed)
