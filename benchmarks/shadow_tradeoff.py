@@ -9,7 +9,7 @@ one (both with 512 slices, as cubic cells are too many) and two passes from eith
 samples to mask, capacities known. Programs are compiled side by side for four fifths of the time; then, with nothing
 beside, all are timed in turns, twice. A line of DIR/shadow-tradeoff-cpu.jsonl (or gpu) is a configuration; what is
 there, on this device and at this size, is not run again. Capacities and counts, which no device changes, are lines of
-DIR/shadow-sizes.jsonl: with that of another device, and `--only-sizes` makes no more than it, half as much is compiled.
+DIR/shadow-sizes.jsonl: where that comes from another device, half as much is compiled; `--only-sizes` makes it alone.
 Tables and charts: `python -m benchmarks.shadow_tradeoff_charts`.
 """
 
