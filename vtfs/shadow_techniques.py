@@ -57,8 +57,8 @@ def shadow_plan(config: Configuration) -> ShadowPlan:
     params = config.params
     extra = "silhouette" if config.technique == "ptsv" else "vertex"
     return ShadowPlan(
-        tile_px=int(config["tile_px"]),
-        branching=int(config["branching"]),
+        tile_px=int(params.get("tile_px", ShadowPlan.tile_px)),
+        branching=int(params.get("branching", ShadowPlan.branching)),
         bounds=params.get("bounds", "explicit"),  # type: ignore[arg-type]
         extra=extra if params.get("planes", "off") == "on" else "off",
         feedback=params.get("feedback") == "on",
