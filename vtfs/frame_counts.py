@@ -31,7 +31,7 @@ from vtfs.op_counts import (
     walk_rows,
 )
 from vtfs.parameters import PARAMETERS, SHADOW_REFERENCES, Configuration, lists_configuration, shading_batch
-from vtfs.shadow_techniques import shadows_counts
+from vtfs.shadow_counts import shadows_counts
 from vtfs.techniques import REGISTRY, Walked, approximates, assign_chunk, volume_chunk
 
 _BRUTE_FORCE_WORD = 32

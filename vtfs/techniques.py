@@ -43,8 +43,8 @@ from vtfs.parameters import (
 )
 from vtfs.shading import ClusterLight, Image, blend_layers, chunk_blocks, shade
 from vtfs.shadow_mask import ShadowPlan
+from vtfs.shadow_programs import shadow_plan
 from vtfs.shadow_stages import TRANSMIT, CastingStage, casting_stages
-from vtfs.shadow_techniques import shadow_plan
 
 _TESTS_AT_ONCE = {"cpu": 2**19, "gpu": 2**22}
 """`batch = 0` means all queries at once, as far as their rows of boxes stay in the cache of a CPU (12 MB) or leave

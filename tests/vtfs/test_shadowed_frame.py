@@ -19,11 +19,12 @@ from vtfs.light_shadows import CastMask, shadow_bits
 from vtfs.lights import Lights, point_lights
 from vtfs.parameters import SHADOW_REFERENCES, TECHNIQUES, configuration
 from vtfs.reference import ViewShadows, forward_reference, largest_relative_difference
+from vtfs.shadow_capacities import fitted_to_all
 from vtfs.shadow_casters import Casters
 from vtfs.shadow_inputs import FrameShadows, brightest_lights, receiving
 from vtfs.shadow_maps import shadow_maps
+from vtfs.shadow_programs import shadow_plan
 from vtfs.shadow_scene import ShadowScene
-from vtfs.shadow_techniques import fitted_to_all, shadow_plan
 from vtfs.techniques import Plan
 from vtfs.view_samples import ViewSamples
 
