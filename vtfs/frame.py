@@ -13,6 +13,7 @@ import numpy as np
 
 from vtfs.cluster_grid import n_keys
 from vtfs.frame_inputs import FrameInputs
+from vtfs.frame_plan import Plan, Stage
 from vtfs.frame_sizes import NO_SIZES, CapacityError, Sizes, rounded_up
 from vtfs.gbuffer import from_runs
 from vtfs.light_shadows import CastMask
@@ -23,7 +24,7 @@ from vtfs.shadow_mask import ShadowMask, ShadowPlan, uncounted
 from vtfs.shadow_programs import alpha_plan, shadow_plan
 from vtfs.shadow_stages import TRANSMIT
 from vtfs.shadow_techniques import CastShadows, on_host
-from vtfs.techniques import REGISTRY, Plan, Stage
+from vtfs.techniques import REGISTRY
 
 
 def planned(config: Configuration, sizes: Sizes) -> Plan:

@@ -13,6 +13,7 @@ from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
 from vtfs.frame import cast_counted, cast_program, image_on_host, render, run_stages
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
+from vtfs.frame_plan import Plan
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.light_shadows import CastMask, shadow_bits
@@ -25,7 +26,6 @@ from vtfs.shadow_inputs import FrameShadows, brightest_lights, receiving
 from vtfs.shadow_maps import shadow_maps
 from vtfs.shadow_programs import shadow_plan
 from vtfs.shadow_scene import ShadowScene
-from vtfs.techniques import Plan
 from vtfs.view_samples import ViewSamples
 
 SUNS = DirectionalLights(np.array([[0.3, 1.0, 0.4], [-2.0, 0.5, 0.0]]), np.array([[1.0, 0.9, 0.7], [0.2, 0.3, 0.6]]))
