@@ -12,12 +12,12 @@ import jax
 import numpy as np
 
 from vtfs.cluster_grid import n_keys
+from vtfs.configurations import Configuration
 from vtfs.frame_inputs import FrameInputs
 from vtfs.frame_plan import Plan, Stage
 from vtfs.frame_sizes import NO_SIZES, CapacityError, Sizes, rounded_up
 from vtfs.gbuffer import from_runs
 from vtfs.light_shadows import CastMask
-from vtfs.parameters import Configuration
 from vtfs.shadow_capacities import fitted_to_all, shadow_sizes, with_shadow_sizes
 from vtfs.shadow_inputs import ShadowTask, alpha_receiving, receiving
 from vtfs.shadow_mask import ShadowMask, ShadowPlan, uncounted

@@ -9,6 +9,7 @@ import numpy as np
 
 from vtfs.chunk_sizes import assign_chunk, volume_chunk
 from vtfs.cluster_grid import n_cells, tile_and_slices
+from vtfs.configurations import Configuration, lists_configuration, shading_batch
 from vtfs.frame import KeptStages, cast_counted, is_listed, run_stages
 from vtfs.frame_inputs import FrameInputs
 from vtfs.frame_plan import Walked
@@ -32,8 +33,9 @@ from vtfs.op_counts import (
     uniform_lengths,
     walk_rows,
 )
-from vtfs.parameters import PARAMETERS, SHADOW_REFERENCES, Configuration, lists_configuration, shading_batch
+from vtfs.parameters import PARAMETERS
 from vtfs.shadow_counts import shadows_counts
+from vtfs.technique_names import SHADOW_REFERENCES
 from vtfs.techniques import REGISTRY, approximates
 
 _BRUTE_FORCE_WORD = 32

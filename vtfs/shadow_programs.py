@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from vtfs.parameters import Configuration
+from vtfs.configurations import Configuration
 from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan, uncounted
 from vtfs.shadow_volumes.cluster_hierarchy import cluster_hierarchy
 from vtfs.shadow_volumes.ptsv import ptsv

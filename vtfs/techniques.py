@@ -9,6 +9,7 @@ import functools
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from vtfs.configurations import Configuration, lists_configuration, passes_only_what_meets_the_box
 from vtfs.frame_plan import Plan, Stage, Walked
 from vtfs.light_culling import needs_sections
 from vtfs.light_stages import (
@@ -27,15 +28,9 @@ from vtfs.light_stages import (
     fastest_for,
     light_volume_stages,
 )
-from vtfs.parameters import (
-    SHADOW_NAMES,
-    SHADOW_REFERENCES,
-    Configuration,
-    lists_configuration,
-    passes_only_what_meets_the_box,
-)
 from vtfs.shadow_programs import shadow_plan
 from vtfs.shadow_stages import TRANSMIT, CastingStage, casting_stages
+from vtfs.technique_names import SHADOW_NAMES, SHADOW_REFERENCES
 
 Lists = Literal["clusters", "light_volumes", "none"]
 

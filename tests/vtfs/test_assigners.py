@@ -7,10 +7,10 @@ from tests.strategies import a_camera, adversarial_lights, surface_samples
 from tests.vtfs.test_light_assignment import listed_lights
 from tests.vtfs.test_light_culling import as_spots
 from vtfs import light_stages
+from vtfs.configurations import ConflictError, configuration
 from vtfs.frame import stage_program
 from vtfs.frame_counts import FrameCounts, count
 from vtfs.frame_inputs import FrameInputs
-from vtfs.parameters import ConflictError, configuration
 from vtfs.techniques import REGISTRY
 
 CASES = {
