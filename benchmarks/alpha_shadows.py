@@ -25,10 +25,10 @@ from vtfs.device import keep_compiled_programs
 from vtfs.gallery import build_scene
 from vtfs.sample_patterns import extrapolated_sub_samples, resolved, traced_sub_samples
 from vtfs.scene import Scene
+from vtfs.shadow_capacities import shadow_sizes, with_shadow_sizes
 from vtfs.shadow_casters import ShadowLight
 from vtfs.shadow_mask import ShadowPlan, facing_samples
 from vtfs.shadow_references import brute_force, classify, view_points_m
-from vtfs.shadow_techniques import shadow_sizes, with_shadow_sizes
 from vtfs.tracer import Tracer
 from vtfs.transmittance_references import ReferenceLight, brute_force_transmittance
 from vtfs.transmitted_light import transmitted_light

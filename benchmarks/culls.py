@@ -12,10 +12,11 @@ import math
 import numpy as np
 
 from vtfs.camera import Viewport
+from vtfs.configurations import Configuration, configuration
 from vtfs.false_positives import ListedPairs, listed_pairs
 from vtfs.frame import run_stages
 from vtfs.frame_inputs import FrameInputs
-from vtfs.parameters import Configuration, Value, configuration
+from vtfs.parameters import Value
 from vtfs.scene_setup import SceneOptions, set_up
 
 CULLS = ("planes", "screen_rect", "frustum")

@@ -33,13 +33,14 @@ from tests.strategies import (
 )
 from tests.strategies import surface_samples as smooth_samples
 from vtfs.camera import Camera, Lens, Viewport
+from vtfs.configurations import Configuration, configuration
 from vtfs.frame import run_stages
 from vtfs.frame_inputs import FrameInputs
 from vtfs.frame_sizes import NO_SIZES
 from vtfs.input_error import InputError
 from vtfs.light_volumes import LightPixels
 from vtfs.lights import Lights, cone_cosines
-from vtfs.parameters import Configuration, Value, configuration
+from vtfs.parameters import Value
 from vtfs.view_samples import ViewSamples
 
 TREE: dict[str, Value] = {"branching": 8, "batch": 1024, "assigner": "published"}

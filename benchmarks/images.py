@@ -14,13 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from vtfs.camera import Viewport
+from vtfs.configurations import configuration
 from vtfs.device import keep_compiled_programs
 from vtfs.frame import render
 from vtfs.frame_inputs import FrameInputs
 from vtfs.gallery import GALLERY
-from vtfs.parameters import SHADOW_NAMES, TECHNIQUES, configuration
+from vtfs.parameters import TECHNIQUES
 from vtfs.reference import forward_reference, largest_relative_difference
 from vtfs.scene_setup import SceneOptions, set_up
+from vtfs.technique_names import SHADOW_NAMES
 
 LIMIT = 1e-4
 MANY_LIGHT = tuple(name for name in TECHNIQUES if name not in SHADOW_NAMES)

@@ -28,6 +28,7 @@ import jax
 import numpy as np
 
 from vtfs.camera import Viewport
+from vtfs.configurations import configuration
 from vtfs.device import device_name
 from vtfs.files import write_atomically
 from vtfs.frame import frame_program, planned, run_stages, stage_program
@@ -35,7 +36,6 @@ from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
 from vtfs.frame_sizes import CapacityError
 from vtfs.lights import Lights, point_lights, scatter_lights
-from vtfs.parameters import configuration
 from vtfs.scene_setup import SceneOptions, SceneSetup, set_up
 from vtfs.techniques import REGISTRY
 from vtfs.view_samples import ViewSamples, trace_view_samples

@@ -16,11 +16,11 @@ from dataclasses import replace
 import numpy as np
 
 from vtfs.camera import Viewport
+from vtfs.configurations import configuration
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
 from vtfs.light_lists import view_lights
 from vtfs.lights import Lights
-from vtfs.parameters import configuration
 from vtfs.scene_setup import SceneOptions, SceneSetup, set_up
 
 AGES = (1, 2, 4, 8, 16, 32)

@@ -18,7 +18,7 @@ from tuning.choose import is_timed, predict_ms
 from tuning.measurement import Measurement
 from tuning.record import read_measurements
 from tuning.stage_models import fit_stage
-from vtfs.parameters import configuration
+from vtfs.configurations import configuration
 
 _FEWEST = 5  # configurations of a technique
 _DRAWS = 24

@@ -11,11 +11,11 @@ import time
 import jax
 import numpy as np
 
+from vtfs.configurations import configuration
 from vtfs.device import device_name
 from vtfs.frame import frame_program, image_on_host, planned, run_stages, stage_program
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
-from vtfs.parameters import configuration
 from vtfs.reference import forward_reference, largest_relative_difference
 from vtfs.scene_setup import SceneOptions, set_up
 from vtfs.techniques import REGISTRY

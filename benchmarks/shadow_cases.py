@@ -18,7 +18,7 @@ from vtfs.gallery import GALLERY, build_scene
 from vtfs.scene import Material, Scene, load_scene
 from vtfs.shadow_casters import Casters, ShadowLight
 from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan, default_bias_m, facing_samples
-from vtfs.shadow_techniques import counting_program
+from vtfs.shadow_programs import counting_program
 from vtfs.view_samples import ViewSamples, trace_view_samples
 
 LIGHT = ShadowLight((10.0, 30.0, -20.0))

@@ -30,9 +30,12 @@ from benchmarks.shadow_cases import FULL_TREE_SLICES, Case, named_case, run_alon
 from benchmarks.shadows import times_ms
 from vtfs.device import device_name, keep_compiled_programs
 from vtfs.files import write_atomically
+from vtfs.shadow_capacities import fitted_to_all
 from vtfs.shadow_casters import FrontFaces
+from vtfs.shadow_counts import shadow_counts
 from vtfs.shadow_mask import ShadowPlan, casters_on_device, shadow_frame
-from vtfs.shadow_techniques import fitted_to_all, shadow_counts, shadow_grid, shadow_program
+from vtfs.shadow_programs import shadow_program
+from vtfs.shadow_techniques import shadow_grid
 
 PAPER = ShadowPlan(tile_px=8, branching=32, feedback=False)
 SILHOUETTE, NO_PLANES = replace(PAPER, extra="silhouette"), replace(PAPER, extra="off")

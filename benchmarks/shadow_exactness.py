@@ -40,8 +40,9 @@ from vtfs.camera import Viewport
 from vtfs.device import device_name, keep_compiled_programs, versions
 from vtfs.files import write_atomically
 from vtfs.gbuffer import from_runs
+from vtfs.shadow_capacities import fitted_to_all, shadow_sizes
 from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
-from vtfs.shadow_techniques import counting_program, fitted_to_all, shadow_sizes
+from vtfs.shadow_programs import counting_program
 
 log = logging.getLogger("benchmarks.shadow_exactness")
 

@@ -30,15 +30,11 @@ from benchmarks.shadows import embree, times_ms
 from vtfs.device import device_name, keep_compiled_programs, versions
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
+from vtfs.shadow_capacities import fitted_to_all, shadow_sizes, with_shadow_sizes
+from vtfs.shadow_counts import shadow_counts
 from vtfs.shadow_mask import CastersOnDevice, ShadowFrame, ShadowPlan, casters_on_device, shadow_frame
-from vtfs.shadow_techniques import (
-    fitted_to_all,
-    shadow_counts,
-    shadow_grid,
-    shadow_program,
-    shadow_sizes,
-    with_shadow_sizes,
-)
+from vtfs.shadow_programs import shadow_program
+from vtfs.shadow_techniques import shadow_grid
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
 
 BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (4, 16, 2, 32)

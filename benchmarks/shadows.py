@@ -30,9 +30,12 @@ from benchmarks.shadow_cases import Case, read_case
 from vtfs.device import device_name, keep_compiled_programs, versions
 from vtfs.files import write_atomically
 from vtfs.gbuffer import from_runs
+from vtfs.shadow_capacities import fitted
+from vtfs.shadow_counts import shadow_counts
 from vtfs.shadow_mask import CastersOnDevice, ShadowFrame, ShadowMask, ShadowPlan, casters_on_device, shadow_frame
+from vtfs.shadow_programs import run_program, shadow_program
 from vtfs.shadow_references import ShadowRays, brute_force, classify, view_points_m
-from vtfs.shadow_techniques import fitted, run_program, shadow_counts, shadow_grid, shadow_program
+from vtfs.shadow_techniques import shadow_grid
 
 N_CHECKED, N_CLASSIFIED = 2_000, 400
 BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (8, 16, 4, 32, 2)

@@ -14,7 +14,8 @@ from scipy.special import bdtr, ndtr
 from tuning.cost_model import CostModel
 from tuning.measurement import FLOAT32_ERROR, Measurement
 from tuning.space import Space
-from vtfs.parameters import Configuration, Value
+from vtfs.configurations import Configuration
+from vtfs.parameters import Value
 
 Objective = Literal["max", "mean"]
 """The slowest frame decides, or the mean over frames."""

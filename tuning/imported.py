@@ -26,9 +26,10 @@ from tuning.record import append_measurement
 from tuning.table_model import Prediction, TableModel
 from tuning.timing_table import TimingTable
 from tuning.transferable import of_our_program
+from vtfs.configurations import Configuration, configuration
 from vtfs.files import write_atomically
 from vtfs.input_error import InputError
-from vtfs.parameters import PARAMETERS, TECHNIQUES, Configuration, configuration
+from vtfs.parameters import PARAMETERS, TECHNIQUES
 
 _DROPPED = 8
 """Terms that a model does without and that are named, those that would help most first."""

@@ -13,8 +13,9 @@ from tuning.formats.csv_sheet import read_sheet
 from tuning.formats.csv_table import CsvLayout, arranged, feature_cells, sheet_times_ms
 from tuning.formats.registry import recognised
 from tuning.record import read_measurements
+from vtfs.configurations import Configuration, configuration
 from vtfs.input_error import InputError
-from vtfs.parameters import PARAMETERS, Configuration, configuration
+from vtfs.parameters import PARAMETERS
 
 Counts = dict[str, float]
 

@@ -12,10 +12,11 @@ from tuning.choose import is_timed, time_ms
 from tuning.measurement import Measurement
 from tuning.sweep import SearchResult
 from tuning.workload import SceneWorkload
+from vtfs.configurations import Configuration, configuration
 from vtfs.image import exposure, heat_map, random_colours, tone_map, write_png
 from vtfs.op_counts import CAPS
-from vtfs.parameters import SHADOW_NAMES, Configuration, configuration
 from vtfs.shadow_maps import ShadowMaps
+from vtfs.technique_names import SHADOW_NAMES
 
 _BINS = 24
 

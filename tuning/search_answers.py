@@ -17,7 +17,8 @@ from tuning.features import operations
 from tuning.measurement import Measurement
 from tuning.questions import fastest_of
 from tuning.sweep import Prediction, SearchResult
-from vtfs.parameters import Value, configuration
+from vtfs.configurations import configuration
+from vtfs.parameters import Value
 
 _SAMPLES = 512
 _MOST_INFLUENTIAL = 3

@@ -16,8 +16,8 @@ from tuning.measurement import Measurement
 from tuning.record import append_measurement, read_measurements
 from tuning.space import Space
 from tuning.stage_models import fit_stage
+from vtfs.configurations import Configuration, configuration
 from vtfs.input_error import InputError
-from vtfs.parameters import Configuration, configuration
 
 
 class Workload(Protocol):

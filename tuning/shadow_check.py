@@ -10,6 +10,7 @@ import numpy as np
 
 from vtfs.alpha_casters import Blending, Casting
 from vtfs.cache import cached
+from vtfs.configurations import Configuration
 from vtfs.frame import image_on_host
 from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
@@ -17,7 +18,6 @@ from vtfs.input_error import InputError
 from vtfs.layers import Layers, TransparentLayer
 from vtfs.light_shadows import CastMask
 from vtfs.lights import Lights
-from vtfs.parameters import Configuration
 from vtfs.reference import ViewShadows, forward_reference
 from vtfs.shadow_casters import FrontFaces
 from vtfs.shadow_inputs import FrameShadows

@@ -13,17 +13,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from vtfs.configurations import Configuration, ConflictError, configuration
 from vtfs.input_error import InputError
-from vtfs.parameters import (
-    ONLY_WITH,
-    PARAMETERS,
-    SHADOW_NAMES,
-    TECHNIQUES,
-    Configuration,
-    ConflictError,
-    Value,
-    configuration,
-)
+from vtfs.parameters import ONLY_WITH, PARAMETERS, TECHNIQUES, Value
+from vtfs.technique_names import SHADOW_NAMES
 
 LARGEST_SPACE = 100_000
 """More combinations than this are refused: counting them all would take hours."""

@@ -22,7 +22,8 @@ from tuning.measurement import Measurement
 from tuning.search_run import Progress, SearchRun, Workload
 from tuning.space import Space, accuracy_values
 from tuning.stage_models import fit_models
-from vtfs.parameters import SHADOW_NAMES, Configuration
+from vtfs.configurations import Configuration
+from vtfs.technique_names import SHADOW_NAMES
 
 HOPELESS = 12
 """A technique whose default needs this many times the lighting computations of the thriftiest is not measured."""

@@ -25,10 +25,11 @@ from tuning.shadow_check import one_blending
 from tuning.space import Space, default_space
 from tuning.sweep import SearchResult, search
 from tuning.workload import ScenePath, SceneWorkload, busiest_frames, cached_counts
+from vtfs.configurations import Configuration, configuration
 from vtfs.device import versions
 from vtfs.files import write_atomically
-from vtfs.parameters import Configuration, casts_shadows, configuration
 from vtfs.scene_setup import SceneSetup
+from vtfs.technique_names import casts_shadows
 
 DEFAULT_BUDGET = Budget(seconds=40.0)
 """On two CPU cores a frame costs half a second: a dozen configurations, and a minute for the whole command."""

@@ -21,6 +21,7 @@ from tuning.shadow_check import MaskCheck, ShadowChecker, light_on_host, masks_o
 from tuning.timing import interleaved_ms, repeats_ms, timed_ms
 from vtfs.cache import cached
 from vtfs.cell_maps import CellMaps, cell_maps
+from vtfs.configurations import Configuration, changes_shadows, configuration, counted_configuration
 from vtfs.device import device_name, versions
 from vtfs.frame import cast_program, frame_program, image_on_host, is_listed, planned, run_stages, stage_program
 from vtfs.frame_counts import FrameCounts, count
@@ -30,7 +31,6 @@ from vtfs.input_error import InputError
 from vtfs.light_shadows import CastMask
 from vtfs.lights import Lights
 from vtfs.op_counts import ListLengths, OpCounts
-from vtfs.parameters import Configuration, changes_shadows, configuration, counted_configuration
 from vtfs.reference import forward_reference, image_error
 from vtfs.shadow_maps import ShadowMaps, shadow_maps
 from vtfs.shadow_scene import ShadowScene

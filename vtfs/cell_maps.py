@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from vtfs.configurations import Configuration, configuration, lists_configuration
 from vtfs.frame import run_stages
 from vtfs.frame_counts import lengths_of
 from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
 from vtfs.light_volumes import lights_of_samples
-from vtfs.parameters import Configuration, configuration, lists_configuration
 from vtfs.techniques import REGISTRY
 
 

@@ -7,10 +7,11 @@ import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from vtfs.configurations import Configuration, counted_configuration
 from vtfs.frame import KeptStages
 from vtfs.frame_counts import FrameCounts, count
 from vtfs.op_counts import OpCounts
-from vtfs.parameters import GRID_PARAMETERS, Configuration, counted_configuration
+from vtfs.parameters import GRID_PARAMETERS
 from vtfs.scene_setup import SceneSetup
 
 

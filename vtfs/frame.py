@@ -12,24 +12,19 @@ import jax
 import numpy as np
 
 from vtfs.cluster_grid import n_keys
+from vtfs.configurations import Configuration
 from vtfs.frame_inputs import FrameInputs
+from vtfs.frame_plan import Plan, Stage
 from vtfs.frame_sizes import NO_SIZES, CapacityError, Sizes, rounded_up
 from vtfs.gbuffer import from_runs
 from vtfs.light_shadows import CastMask
-from vtfs.parameters import Configuration
+from vtfs.shadow_capacities import fitted_to_all, shadow_sizes, with_shadow_sizes
 from vtfs.shadow_inputs import ShadowTask, alpha_receiving, receiving
 from vtfs.shadow_mask import ShadowMask, ShadowPlan, uncounted
+from vtfs.shadow_programs import alpha_plan, shadow_plan
 from vtfs.shadow_stages import TRANSMIT
-from vtfs.shadow_techniques import (
-    CastShadows,
-    alpha_plan,
-    fitted_to_all,
-    on_host,
-    shadow_plan,
-    shadow_sizes,
-    with_shadow_sizes,
-)
-from vtfs.techniques import REGISTRY, Plan, Stage
+from vtfs.shadow_techniques import CastShadows, on_host
+from vtfs.techniques import REGISTRY
 
 
 def planned(config: Configuration, sizes: Sizes) -> Plan:

@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from vtfs.chunk_sizes import assign_chunk, volume_chunk
 from vtfs.cluster_grid import n_cells, tile_and_slices
+from vtfs.configurations import Configuration, lists_configuration, shading_batch
 from vtfs.frame import KeptStages, cast_counted, is_listed, run_stages
 from vtfs.frame_inputs import FrameInputs
+from vtfs.frame_plan import Walked
 from vtfs.frame_sizes import NO_SIZES, Sizes
 from vtfs.light_assignment.brute_force import every_pair
 from vtfs.light_lists import AssignCounts
@@ -30,9 +33,10 @@ from vtfs.op_counts import (
     uniform_lengths,
     walk_rows,
 )
-from vtfs.parameters import PARAMETERS, SHADOW_REFERENCES, Configuration, lists_configuration, shading_batch
-from vtfs.shadow_techniques import shadows_counts
-from vtfs.techniques import REGISTRY, Walked, approximates, assign_chunk, volume_chunk
+from vtfs.parameters import PARAMETERS
+from vtfs.shadow_counts import shadows_counts
+from vtfs.technique_names import SHADOW_REFERENCES
+from vtfs.techniques import REGISTRY, approximates
 
 _BRUTE_FORCE_WORD = 32
 _NO_STRUCTURES = (

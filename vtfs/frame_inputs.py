@@ -10,15 +10,16 @@ import jax
 import numpy as np
 
 from vtfs.cluster_grid import cluster_grid, configured_grid
+from vtfs.configurations import Configuration, lists_configuration
 from vtfs.gbuffer import RUN_WIDTH_PX, Fragments, GBuffer, LayerTable, Positions
 from vtfs.input_error import InputError
 from vtfs.light_assignment.light_tree import reduce_lights, sort_lights
 from vtfs.light_lists import ViewLights, view_lights
 from vtfs.lights import Lights
 from vtfs.morton import morton_codes
-from vtfs.parameters import SHADOW_REFERENCES, Configuration, lists_configuration
 from vtfs.shadow_inputs import FrameShadows
 from vtfs.shadow_scene import ShadowScene
+from vtfs.technique_names import SHADOW_REFERENCES
 from vtfs.techniques import REGISTRY
 from vtfs.view_samples import ViewSamples
 

@@ -17,12 +17,12 @@ from vtfs.alpha_casters import (
     Blending,
     Casting,
 )
+from vtfs.configurations import Configuration
 from vtfs.gbuffer import Fragments, to_runs
 from vtfs.input_error import InputError
 from vtfs.layers import Layers
 from vtfs.light_shadows import MAX_SHADOW_LIGHTS, CastMask, ShadowSlots
 from vtfs.lights import Lights
-from vtfs.parameters import Configuration
 from vtfs.shadow_casters import FrontFaces, ShadowLight, require_near
 from vtfs.shadow_mask import (
     CastersOnDevice,

@@ -7,10 +7,11 @@ from typing import Literal
 
 import numpy as np
 
+from vtfs.configurations import Configuration
 from vtfs.frame import cast_counted, image_on_host
 from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
-from vtfs.parameters import SHADOW_REFERENCES, STENCIL_NAMES, Configuration
+from vtfs.technique_names import SHADOW_REFERENCES, STENCIL_NAMES
 from vtfs.techniques import REGISTRY
 
 

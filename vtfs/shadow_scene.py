@@ -15,13 +15,14 @@ from vtfs.alpha_casters import (
     alpha_on_device,
     scene_casters,
 )
+from vtfs.configurations import Configuration
 from vtfs.directional_lights import DirectionalLights
 from vtfs.input_error import InputError
 from vtfs.light_shadows import MAX_SHADOW_LIGHTS
-from vtfs.parameters import STENCIL_NAMES, Configuration
 from vtfs.shadow_casters import Casters
 from vtfs.shadow_mask import CastersOnDevice, casters_on_device, default_bias_m
 from vtfs.shadow_references import ShadowRays
+from vtfs.technique_names import STENCIL_NAMES
 
 if TYPE_CHECKING:
     from vtfs.scene import Scene

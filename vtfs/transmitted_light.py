@@ -15,9 +15,10 @@ from jaxtyping import Array, UInt32
 from vtfs.alpha_casters import AlphaSurfaces, Blending, SceneCasters, alpha_on_device, scene_bias_m
 from vtfs.gbuffer import Fragments, from_runs
 from vtfs.input_error import InputError
+from vtfs.shadow_capacities import fitted_to_all
 from vtfs.shadow_casters import FrontFaces, ShadowLight, require_near
 from vtfs.shadow_mask import ShadowFrame, ShadowPlan, casters_on_device, require_choice, shadow_frame
-from vtfs.shadow_techniques import CastShadows, cast_by_bias, fitted_to_all, on_host, shadow_grid
+from vtfs.shadow_techniques import CastShadows, cast_by_bias, on_host, shadow_grid
 from vtfs.shadow_volumes.transmittance import Transmitted, transmit
 from vtfs.view_samples import ViewSamples
 

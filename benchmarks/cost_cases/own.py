@@ -13,7 +13,7 @@ from benchmarks.cost_cases.peers import Case, Peers
 from tuning.features import STAGE_TERMS, with_derived
 from tuning.table_model import fit_table
 from tuning.timing_table import TimingTable
-from vtfs.parameters import configuration
+from vtfs.configurations import configuration
 
 Line = tuple[str, str, str]
 _FOLDS = 5

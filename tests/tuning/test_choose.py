@@ -23,7 +23,7 @@ from tuning.cost_model import CostModel
 from tuning.measurement import FLOAT32_ERROR, Measurement, Outcome
 from tuning.space import Space
 from tuning.stage_models import fit_stage
-from vtfs.parameters import configuration
+from vtfs.configurations import configuration
 
 
 def measurement(*frames_ms, error=None, outcome: Outcome = "timed") -> Measurement:

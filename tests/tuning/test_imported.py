@@ -11,8 +11,8 @@ from tuning.imported import tune_imported
 from tuning.imported_times import read_imported
 from tuning.measurement import Measurement
 from tuning.record import append_measurement, read_measurements
+from vtfs.configurations import configuration
 from vtfs.input_error import InputError
-from vtfs.parameters import configuration
 
 TILES = (4, 8, 12, 16, 24, 32, 48, 64)
 

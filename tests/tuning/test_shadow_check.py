@@ -6,7 +6,7 @@ import pytest
 from tests.strategies import nearby_lights
 from tests.vtfs.test_shadowed_frame import a_frame, slow_image
 from tuning.shadow_check import ShadowChecker
-from vtfs.parameters import configuration
+from vtfs.configurations import configuration
 from vtfs.reference import largest_relative_difference
 
 PTSV = configuration("ptsv")

@@ -5,8 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tuning.space import LARGEST_SPACE, Space, accuracy_values, default_space, load_space
+from vtfs.configurations import configuration
 from vtfs.input_error import InputError
-from vtfs.parameters import TECHNIQUES, TUNED_TECHNIQUES, configuration
+from vtfs.parameters import TECHNIQUES
+from vtfs.technique_names import TUNED_TECHNIQUES
 
 ALL = TUNED_TECHNIQUES
 

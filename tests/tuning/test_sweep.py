@@ -16,8 +16,8 @@ from tuning.record import read_measurements
 from tuning.search_run import Progress, Workload
 from tuning.space import Space, default_space
 from tuning.sweep import PATIENCE, search
+from vtfs.configurations import Configuration, configuration
 from vtfs.input_error import InputError
-from vtfs.parameters import Configuration, configuration
 
 FRAMES = (40, 11, 3)
 _WORK = (1.6, 1.0, 0.5)  # of the three frames

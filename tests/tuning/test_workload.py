@@ -17,11 +17,12 @@ from tuning.sweep import search
 from tuning.tune import choose_frames
 from tuning.workload import LOST, ScenePath, SceneWorkload, busiest_frames, cached_counts
 from vtfs.camera import Viewport
+from vtfs.configurations import configuration
 from vtfs.device import keep_compiled_programs
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
-from vtfs.parameters import TUNED_TECHNIQUES, configuration
 from vtfs.scene_setup import SceneOptions, set_up
+from vtfs.technique_names import TUNED_TECHNIQUES
 
 FRAMES = (0, 30, 45)
 

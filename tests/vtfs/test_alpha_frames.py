@@ -13,6 +13,7 @@ from tests.vtfs.test_shadowed_frame import SUNS
 from tuning.shadow_check import ShadowChecker, light_on_host, masks_on_host, one_blending
 from vtfs.alpha_casters import Blending
 from vtfs.camera import Camera, Viewport
+from vtfs.configurations import configuration
 from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
 from vtfs.frame import cast_program, planned, render, run_stages
 from vtfs.frame_counts import FrameCounts, count
@@ -20,7 +21,6 @@ from vtfs.frame_inputs import FrameInputs
 from vtfs.gallery import build_scene
 from vtfs.input_error import InputError
 from vtfs.lights import Lights, point_lights
-from vtfs.parameters import configuration
 from vtfs.reference import ViewShadows, forward_reference, largest_relative_difference
 from vtfs.scene import AlphaMode, Material, Scene
 from vtfs.shadow_casters import BIAS

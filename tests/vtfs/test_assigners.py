@@ -6,11 +6,11 @@ import pytest
 from tests.strategies import a_camera, adversarial_lights, surface_samples
 from tests.vtfs.test_light_assignment import listed_lights
 from tests.vtfs.test_light_culling import as_spots
-from vtfs import techniques
+from vtfs import light_stages
+from vtfs.configurations import ConflictError, configuration
 from vtfs.frame import stage_program
 from vtfs.frame_counts import FrameCounts, count
 from vtfs.frame_inputs import FrameInputs
-from vtfs.parameters import ConflictError, configuration
 from vtfs.techniques import REGISTRY
 
 CASES = {
@@ -33,7 +33,7 @@ def a_frame(spots):
 @pytest.fixture
 def few_is_none(monkeypatch):
     """`auto` refines lists from the first light on."""
-    monkeypatch.setitem(techniques._FEW_LIGHTS, "cpu", 0)
+    monkeypatch.setitem(light_stages._FEW_LIGHTS, "cpu", 0)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -70,7 +70,7 @@ def test_both_ways_of_auto_make_the_same_lists(monkeypatch):
     config = configuration("tiled_deferred", {"batch": 1024})
     found = []
     for few, walked in ((100, "all_pairs"), (0, "groups")):
-        monkeypatch.setitem(techniques._FEW_LIGHTS, "cpu", few)
+        monkeypatch.setitem(light_stages._FEW_LIGHTS, "cpu", few)
         # Programs are kept by their configuration: this one is made with another constant.
         stage_program.cache_clear()
         assert count(config, inputs)[0].walked == walked

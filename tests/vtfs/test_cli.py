@@ -14,19 +14,14 @@ from PIL import Image
 
 from tests.command_line import ROOT, SMALL, STREET, Ran, finished, full_disk, is_refused, started, vtfs
 from vtfs.camera import Viewport, load_cameras, save_cameras
+from vtfs.configurations import configuration
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
 from vtfs.gallery import GALLERY, build_scene
-from vtfs.parameters import (
-    PARAMETERS,
-    SHADOW_NAMES,
-    TECHNIQUE_GROUPS,
-    TECHNIQUES,
-    TUNED_TECHNIQUES,
-    configuration,
-)
+from vtfs.parameters import PARAMETERS, TECHNIQUES
 from vtfs.scene import save_scene
 from vtfs.scene_setup import SceneOptions, set_up
+from vtfs.technique_names import SHADOW_NAMES, TECHNIQUE_GROUPS, TUNED_TECHNIQUES
 
 COMMANDS = ("tune", "count", "render", "stability", "report", "scenes", "techniques", "doctor")
 CAMERA = {

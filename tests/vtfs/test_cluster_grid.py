@@ -24,8 +24,8 @@ from vtfs.cluster_grid import (
     n_keys,
     slice_depth_m,
 )
+from vtfs.configurations import configuration
 from vtfs.input_error import InputError
-from vtfs.parameters import configuration
 
 some = settings(max_examples=60, deadline=None)
 slices_jit = jax.jit(depth_slices)

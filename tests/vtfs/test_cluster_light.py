@@ -13,12 +13,12 @@ from tests import oracles
 from tests.strategies import a_camera, layered_samples, nearby_lights, seeds, surface_samples
 from vtfs.bounds import Aabb
 from vtfs.cluster_light import lit_range
+from vtfs.configurations import configuration
 from vtfs.frame import render, run_stages
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
 from vtfs.light_lists import view_lights
 from vtfs.normal_cones import NormalCones
-from vtfs.parameters import configuration
 from vtfs.reference import largest_relative_difference
 from vtfs.techniques import REGISTRY
 

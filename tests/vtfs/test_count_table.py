@@ -9,10 +9,10 @@ from tests.command_line import vtfs
 from tests.slow_counts import slow_counts
 from vtfs import frame
 from vtfs.camera import Viewport
+from vtfs.configurations import configuration
 from vtfs.count_table import count_frames, counts_csv, print_counts
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
-from vtfs.parameters import configuration
 from vtfs.scene_setup import SceneOptions, set_up
 
 CONFIGURATIONS = (

@@ -16,11 +16,11 @@ from tests.strategies import (
     surface_samples,
 )
 from vtfs import frame, frame_sizes
+from vtfs.configurations import configuration
 from vtfs.frame import image_on_host, render, run_stages
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
 from vtfs.frame_sizes import CapacityError, Sizes, rounded_up
-from vtfs.parameters import configuration
 
 BATCH = 1024
 

@@ -24,12 +24,12 @@ from tests.strategies import (
 )
 from vtfs.bounds import Aabb, Sphere
 from vtfs.clusters import Clusters
+from vtfs.configurations import configuration
 from vtfs.frame import run_stages
 from vtfs.frame_inputs import FrameInputs
 from vtfs.input_error import InputError
 from vtfs.light_assignment.brute_force import assign_brute_force
 from vtfs.light_assignment.light_tree import assign_tree, light_tree, reduce_lights, sort_lights
-from vtfs.parameters import configuration
 from vtfs.techniques import REGISTRY
 
 BATCH = 1024  # small chunks: a chunk's cost does not depend on how much of it is used

@@ -23,11 +23,11 @@ from tests.strategies import (
 )
 from tests.vtfs.test_light_assignment import listed_lights
 from vtfs.camera import Lens, Viewport
+from vtfs.configurations import configuration
 from vtfs.false_positives import ListedPairs, listed_pairs
 from vtfs.frame import run_stages
 from vtfs.frame_inputs import FrameInputs
 from vtfs.lights import Lights, cone_cosines
-from vtfs.parameters import configuration
 from vtfs.view_samples import ViewSamples
 
 VOLUME = {"branching": 8, "batch": 1024}

@@ -18,12 +18,12 @@ from tests.strategies import (
     through,
 )
 from vtfs.camera import Lens
+from vtfs.configurations import configuration
 from vtfs.frame import run_stages
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
 from vtfs.light_volumes import lights_of_samples
-from vtfs.parameters import configuration
 
 BATCH = 1024
 

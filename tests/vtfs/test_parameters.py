@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vtfs.configurations import ConflictError, configuration
 from vtfs.input_error import InputError
-from vtfs.parameters import PARAMETERS, TECHNIQUES, ConflictError, configuration, default_value
+from vtfs.parameters import PARAMETERS, TECHNIQUES, default_value
 
 NOT_NUMBERS = ["abc", "", math.inf, -math.inf, math.nan, "nan", "inf", True, False, None, [], {}, 1j, 10**400, "1e999"]
 OUT_OF_RANGE = {

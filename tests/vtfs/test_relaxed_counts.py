@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from tests.strategies import WIDE, a_camera, adversarial_lights, nearby_lights, random_samples, samples_at, seeds
 from vtfs.camera import Camera
+from vtfs.configurations import configuration
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
-from vtfs.parameters import configuration
 from vtfs.relaxed_counts import (
     CandidatePairs,
     cubic_depth_slices,

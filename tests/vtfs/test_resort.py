@@ -7,11 +7,11 @@ import pytest
 
 from tests.strategies import a_camera, nearby_lights, surface_samples
 from tests.vtfs.test_light_assignment import listed_lights
+from vtfs.configurations import configuration
 from vtfs.frame import run_stages
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
 from vtfs.light_lists import view_lights
-from vtfs.parameters import configuration
 from vtfs.techniques import REGISTRY
 
 SAMPLES = surface_samples(a_camera(), 11)

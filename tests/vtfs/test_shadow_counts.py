@@ -11,8 +11,10 @@ import pytest
 
 from tests.strategies import SMALL, a_camera, surface_samples
 from tests.vtfs.test_shadow_mask import CLUSTERS, N_TRIANGLES, TILES, light_of, soup
+from vtfs.shadow_counts import shadow_counts
 from vtfs.shadow_mask import ShadowFrame, ShadowPlan, casters_on_device, default_bias_m, shadow_frame
-from vtfs.shadow_techniques import run_program, shadow_counts, shadow_grid
+from vtfs.shadow_programs import run_program
+from vtfs.shadow_techniques import shadow_grid
 from vtfs.shadow_volumes import cluster_hierarchy
 from vtfs.shadow_volumes import ptsv as tiles
 from vtfs.shadow_volumes.hierarchy import Hierarchy

@@ -19,6 +19,7 @@ from vtfs.gallery import build_scene
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.scene import load_scene
+from vtfs.shadow_capacities import fitted
 from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight, opaque_casters, welded
 from vtfs.shadow_mask import (
     ShadowPlan,
@@ -29,6 +30,7 @@ from vtfs.shadow_mask import (
     shadow_frame,
     uncounted,
 )
+from vtfs.shadow_programs import run_program, shadow_program
 from vtfs.shadow_references import (
     ShadowRays,
     brute_force,
@@ -38,7 +40,7 @@ from vtfs.shadow_references import (
     kept_casters,
     view_points_m,
 )
-from vtfs.shadow_techniques import cast_by_bias, cast_shadows, fitted, on_host, run_program, shadow_grid, shadow_program
+from vtfs.shadow_techniques import cast_by_bias, cast_shadows, on_host, shadow_grid
 from vtfs.shadow_volumes.full_tree import n_cells, require_room
 from vtfs.shadow_volumes.volumes import volumes
 from vtfs.shadow_volumes.walk import restart_level

@@ -9,22 +9,25 @@ import pytest
 from tests import oracles
 from tests.strategies import a_camera, layered_samples, nearby_lights, surface_samples
 from tests.vtfs.test_frame import Compiles
+from vtfs.configurations import configuration
 from vtfs.directional_lights import NO_DIRECTIONAL, DirectionalLights
 from vtfs.frame import cast_counted, cast_program, image_on_host, render, run_stages
 from vtfs.frame_counts import count
 from vtfs.frame_inputs import FrameInputs
+from vtfs.frame_plan import Plan
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.light_shadows import CastMask, shadow_bits
 from vtfs.lights import Lights, point_lights
-from vtfs.parameters import SHADOW_REFERENCES, TECHNIQUES, configuration
+from vtfs.parameters import TECHNIQUES
 from vtfs.reference import ViewShadows, forward_reference, largest_relative_difference
+from vtfs.shadow_capacities import fitted_to_all
 from vtfs.shadow_casters import Casters
 from vtfs.shadow_inputs import FrameShadows, brightest_lights, receiving
 from vtfs.shadow_maps import shadow_maps
+from vtfs.shadow_programs import shadow_plan
 from vtfs.shadow_scene import ShadowScene
-from vtfs.shadow_techniques import fitted_to_all, shadow_plan
-from vtfs.techniques import Plan
+from vtfs.technique_names import SHADOW_REFERENCES
 from vtfs.view_samples import ViewSamples
 
 SUNS = DirectionalLights(np.array([[0.3, 1.0, 0.4], [-2.0, 0.5, 0.0]]), np.array([[1.0, 0.9, 0.7], [0.2, 0.3, 0.6]]))

@@ -21,10 +21,12 @@ from tests.strategies import (
     through,
 )
 from vtfs.camera import Lens
+from vtfs.configurations import configuration
 from vtfs.frame import image_on_host, render, run_stages
 from vtfs.frame_inputs import FrameInputs
-from vtfs.parameters import SHADOW_REFERENCES, TECHNIQUES, configuration
+from vtfs.parameters import TECHNIQUES
 from vtfs.reference import forward_reference, largest_relative_difference
+from vtfs.technique_names import SHADOW_REFERENCES
 from vtfs.techniques import REGISTRY
 
 few = settings(max_examples=5, deadline=None)

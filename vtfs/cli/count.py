@@ -20,7 +20,8 @@ from vtfs.cli.options import (
 from vtfs.cli.scene_arguments import SceneArguments, with_scene
 from vtfs.cli.status import Status
 from vtfs.input_error import InputError
-from vtfs.parameters import TECHNIQUE_GROUPS, TECHNIQUES, named_techniques
+from vtfs.parameters import TECHNIQUES
+from vtfs.technique_names import TECHNIQUE_GROUPS, named_techniques
 
 
 @with_scene

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from vtfs.parameters import PARAMETERS, TECHNIQUE_GROUPS, TECHNIQUES
+from vtfs.parameters import PARAMETERS, TECHNIQUES
+from vtfs.technique_names import TECHNIQUE_GROUPS
 
 
 def scenes() -> None:

@@ -10,8 +10,9 @@ from typing import Annotated
 
 import typer
 
+from vtfs.configurations import Configuration, configuration
 from vtfs.input_error import InputError
-from vtfs.parameters import TECHNIQUES, Configuration, configuration
+from vtfs.parameters import TECHNIQUES
 
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", help="A parameter, as tile_px=16. Repeatable.", metavar="NAME=VALUE")

@@ -19,7 +19,7 @@ from vtfs.cli.options import (
 )
 from vtfs.cli.scene_arguments import SceneArguments, with_scene
 from vtfs.cli.status import Status
-from vtfs.parameters import SHADOW_REFERENCES
+from vtfs.technique_names import SHADOW_REFERENCES
 
 
 @with_scene

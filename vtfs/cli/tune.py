@@ -14,7 +14,7 @@ from vtfs.cli.options import JsonOption, VerboseOption, check_folder, set_log_le
 from vtfs.cli.scene_arguments import SceneArguments, with_scene
 from vtfs.cli.status import Status
 from vtfs.input_error import InputError
-from vtfs.parameters import TUNED_TECHNIQUES, casts_shadows, named_techniques
+from vtfs.technique_names import TUNED_TECHNIQUES, casts_shadows, named_techniques
 
 if TYPE_CHECKING:
     from reports.recommendation import Recommendation

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vtfs.configurations import Configuration, configuration
 from vtfs.frame import run_stages
 from vtfs.frame_inputs import FrameInputs
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.lights import Lights
-from vtfs.parameters import Configuration, Value, configuration
+from vtfs.parameters import Value
 from vtfs.view_samples import ViewSamples
 
 N_LIGHTS = 128

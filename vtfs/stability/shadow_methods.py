@@ -14,10 +14,12 @@ import numpy as np
 
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
+from vtfs.shadow_capacities import fitted
 from vtfs.shadow_casters import Casters, ShadowLight
 from vtfs.shadow_mask import CastersOnDevice, ShadowFrame, ShadowPlan, Stencil, casters_on_device, shadow_frame
+from vtfs.shadow_programs import run_program
 from vtfs.shadow_references import ShadowRays, view_points_m
-from vtfs.shadow_techniques import fitted, run_program, shadow_grid
+from vtfs.shadow_techniques import shadow_grid
 from vtfs.shadow_volumes.planes import Precision
 from vtfs.shadow_volumes.stencil import PolygonCounts, count_polygons, is_set
 from vtfs.stability.stage import ShadowCase
