@@ -43,7 +43,7 @@ IMPLICIT, FEEDBACK = replace(PAPER, bounds="implicit"), replace(PAPER, feedback=
 TWO_PASSES, FULL = replace(PAPER, passes=2), replace(PAPER, tree="full")
 LARGE_TILES = replace(PAPER, tile_px=16)
 
-TIMED = {"32 children, no feedback": PAPER, "our defaults": ShadowPlan()}
+TIMED = {"32 children, no feedback": PAPER, "8 children, feedback": replace(FEEDBACK, branching=8)}
 
 
 @dataclass(frozen=True)

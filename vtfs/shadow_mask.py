@@ -84,7 +84,7 @@ class ShadowPlan:
     """
 
     tile_px: int = 8
-    branching: int = 8
+    branching: int = 32
     bounds: Bounds = "explicit"
     extra: Extra = "vertex"
     feedback: bool = True
