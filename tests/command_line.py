@@ -17,11 +17,24 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from vtfs.camera import Viewport
+from vtfs.scene_setup import SceneOptions, SceneSetup, set_up
+
 ROOT = Path(__file__).parents[1]
 
 STREET = ("street", "--triangles", "1000", "--size", "64x36")
 SMALL = (*STREET, "--lights", "20")
 """Its programs are compiled once for all tests: shapes depend on the size and on the number of lights."""
+
+CAMERA = {
+    "width": 64,
+    "height": 36,
+    "fov_y_deg": 60,
+    "near": 0.1,
+    "far": 100,
+    "frames": [{"eye": [0, 1, 0], "target": [1, 1, 0], "up": [0, 1, 0]}],
+}
+"""What a file of cameras holds."""
 
 _FRAME_CAP_S = 0.02
 """On a busy machine a frame of a millisecond is repeated for the whole two seconds; here that decides nothing."""
@@ -46,6 +59,16 @@ class Ran:
     @property
     def json(self) -> Any:
         return json.loads(self.out)
+
+
+def small_setup() -> SceneSetup:
+    """What `SMALL` names."""
+    return set_up(SceneOptions("street", viewport=Viewport(64, 36), n_triangles=1000, lights="20"))
+
+
+def write(name: str, content: Any) -> None:
+    """A file of a user's, from a text or from bytes."""
+    Path(name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
 def vtfs(*arguments: object) -> Ran:

@@ -1,4 +1,4 @@
-"""Caches of the tests: never the user's."""
+"""Caches and folders of the tests: never the user's."""
 
 import os
 
@@ -29,3 +29,9 @@ def _programs_of_one_file():
     """Compiled programs go with the file that made them: each takes memory maps, and Linux allows a process 65,530."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def own_folder(tmp_path, monkeypatch):
+    """The working directory is a folder of the test's own: what a command reads and writes by its name lies there."""
+    monkeypatch.chdir(tmp_path)

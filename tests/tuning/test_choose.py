@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 from tests.tuning.measurements import a_measurement
-from tests.tuning.test_sweep import LARGE, SHADING_BOUND, SMALL, WHOLE, Synthetic, erratic
+from tests.tuning.synthetic_workload import LARGE, SHADING_BOUND, SMALL, WHOLE, Synthetic, erratic
 from tuning.choose import (
     choose_next,
     initial_design,

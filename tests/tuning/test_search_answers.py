@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from tests.tuning.test_sweep import SMALL, Synthetic
+from tests.tuning.synthetic_workload import SMALL, Synthetic
 from tuning.answers import answer_lines
 from tuning.budget import Budget
 from tuning.search_answers import search_answers

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.device_rays import BY_ITSELF, LIT, SHADOWED, answers
 from tests.strategies import SMALL, a_camera, surface_samples
-from tests.vtfs.test_shadow_mask import balls, light_of, soup
+from tests.vtfs.shadow_cases import balls, light_of, soup
 from vtfs.shadow_casters import Casters, ShadowLight
 from vtfs.shadow_mask import default_bias_m
 from vtfs.shadow_references import brute_force, facing_light, kept_casters, view_points_m

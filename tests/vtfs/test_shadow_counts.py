@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.strategies import SMALL, a_camera, surface_samples
-from tests.vtfs.test_shadow_mask import CLUSTERS, N_TRIANGLES, TILES, light_of, soup
+from tests.vtfs.shadow_cases import CLUSTERS, N_TRIANGLES, TILES, light_of, soup
 from vtfs.shadow_counts import shadow_counts
 from vtfs.shadow_mask import ShadowFrame, ShadowPlan, casters_on_device, default_bias_m, shadow_frame
 from vtfs.shadow_programs import run_program

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial import ConvexHull
 
 from tests.strategies import SMALL, a_camera, seeds, surface_samples
-from tests.vtfs.test_shadow_mask import CLUSTERS, N_TRIANGLES, N_VERTICES, TILES, light_of, soup
+from tests.vtfs.shadow_cases import CLUSTERS, N_TRIANGLES, N_VERTICES, TILES, light_of, soup
 from vtfs.alpha_casters import AlphaCasters, Blending, alpha_on_device, scene_bias_m, scene_casters
 from vtfs.camera import Camera, Viewport
 from vtfs.gallery import build_scene
