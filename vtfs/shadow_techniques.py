@@ -30,7 +30,7 @@ from vtfs.shadow_volumes.cluster_hierarchy import cluster_hierarchy
 from vtfs.shadow_volumes.full_tree import n_cells, require_room
 from vtfs.shadow_volumes.levels import LANES, LEAF_LANES
 from vtfs.shadow_volumes.ptsv import ptsv
-from vtfs.shadow_volumes.sample_tiles import KEY_BITS
+from vtfs.shadow_volumes.sample_tiles import KEY_BITS, MAX_BLOCKS
 from vtfs.shadow_volumes.z_fail import z_fail
 from vtfs.shadow_volumes.z_pass import z_pass
 from vtfs.view_samples import ViewSamples
@@ -103,7 +103,8 @@ def with_shadow_sizes(plan: ShadowPlan, sizes: tuple[int, ...]) -> ShadowPlan:
 
 
 _FIRST = ShadowPlan(clusters=2**12, groups=2**10, leaf_groups=2**13)
-_LARGEST = 2**26
+_LARGEST = {"clusters": MAX_BLOCKS}
+_LARGEST_OF_LISTS = 2**26
 _FIRST_LISTS = {"z_pass": 2, "z_fail": 2, "ptsv": 1, "cluster_hierarchy": 1}
 """Lists of a level for each triangle, where the search for capacities begins: each step of it compiles, and on a CPU
 what is too large is written all the same."""
@@ -127,6 +128,12 @@ def grid_of(camera: Camera, deepest_m: float, tile_px: int, depth_slices: int) -
     """The same, of a camera whose deepest sample is known."""
     grid = cluster_grid(camera, tile_px, depth_slices, deepest_m)
     n_slices = int(grid.depth_slices)
+    longest_px = max(camera.viewport.width_px, camera.viewport.height_px)
+    if -(-longest_px // tile_px) > 2**KEY_BITS:
+        raise InputError(
+            f"tile_px={tile_px} cuts {longest_px:,} pixels into {-(-longest_px // tile_px):,} tiles along one axis: "
+            f"shadow clusters have at most {2**KEY_BITS:,}; use larger tiles."
+        )
     if n_slices > 2**KEY_BITS:
         raise InputError(
             f"tile_px={tile_px} with depth_slices={depth_slices} makes {n_slices:,} slices: shadow clusters have at "
@@ -167,8 +174,9 @@ def _rounded_up(name: str, needed: int, first: int) -> int:
 
     **Raises:** `InputError` where no capacity holds that many.
     """
-    if needed > _LARGEST:
-        raise InputError(f"shadows: {needed:,} {name} needed, at most {_LARGEST:,} fit; use larger tiles or a batch.")
+    largest = _LARGEST.get(name, _LARGEST_OF_LISTS)
+    if needed > largest:
+        raise InputError(f"shadows: {needed:,} {name} needed, at most {largest:,} fit; use larger tiles or a batch.")
     return max(first, 1 << (max(needed, 1) - 1).bit_length())
 
 
@@ -197,6 +205,7 @@ def fitted_to_all(
     """
     run = run or (lambda plan, i: run_program(technique, plan, frames[i]))
     n_samples = int(np.prod(frames[0].receives.shape))
+    n_first = min(n_samples // min(8, plan.tile_px), MAX_BLOCKS)
     n_triangles = frames[0].triangles.shape[0]
     viewport = frames[0].positions.viewport
     if technique == "cluster_hierarchy":
@@ -207,7 +216,7 @@ def fitted_to_all(
         require_room(plan.cells, plan.branching)
     plan = replace(
         plan,
-        clusters=plan.clusters or _rounded_up("clusters", n_samples // min(8, plan.tile_px), _FIRST.clusters),
+        clusters=plan.clusters or _rounded_up("clusters", n_first, _FIRST.clusters),
         groups=plan.groups or _rounded_up("lists", _FIRST_LISTS[technique] * n_triangles, _FIRST.groups),
         leaf_groups=plan.leaf_groups
         or _rounded_up("leaf lists", n_samples // _FIRST_SHARE[technique], _FIRST.leaf_groups),

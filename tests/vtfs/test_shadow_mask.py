@@ -13,8 +13,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.strategies import SMALL, a_camera, samples_at, seeds, surface_samples
-from vtfs.camera import Camera, Viewport, load_cameras
+from tests.strategies import SMALL, a_camera, samples_at, seeds, surface_samples, through
+from vtfs.camera import Camera, Lens, Viewport, load_cameras
 from vtfs.gallery import build_scene
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
@@ -167,6 +167,56 @@ def test_stencils_shadow_what_brute_force_says(technique, kinds):
         n_shadowed += found.shadowed.sum()
         assert found.counts["test_and_set"] >= found.shadowed.sum()
     assert n_shadowed > 100
+
+
+@pytest.mark.parametrize(
+    ("technique", "plan"), [("cluster_hierarchy", CLUSTERS), ("ptsv", TILES), ("z_pass", CLUSTERS)]
+)
+def test_a_parallel_view_has_the_shadows_that_brute_force_says(technique, plan):
+    n_shadowed = 0
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        camera = a_camera(SMALL)
+        samples, casters = through(surface_samples(camera, seed), Lens(orthographic_height_m=8.0)), balls(camera, rng)
+        light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
+        found = cast(technique, plan, samples, casters, light, bias_m)
+        assert_equal_outside_the_bands(found.shadowed, samples, casters, light, bias_m, 0.02)
+        n_shadowed += found.shadowed.sum()
+    assert n_shadowed > 100
+
+
+@pytest.mark.parametrize("scale", [1e-22, 1e20])
+def test_no_length_is_too_short_or_too_long_for_the_bias(scale):
+    """Squares of these lengths vanish or overflow in float32."""
+    camera, rng = a_camera(SMALL, eye_m=(0.0, 0.0, 0.0)), np.random.default_rng(2)
+    samples, casters = surface_samples(camera, 2), soup(camera, rng, largest=1.0)
+    light = light_of(camera, "inside", rng)
+    scaled = replace(camera, near_m=camera.near_m * scale, far_m=camera.far_m * scale)
+    position_m = (samples.position_m * np.float64(scale)).astype(np.float32)
+    samples = replace(samples, camera=scaled, position_m=position_m)
+    casters = Casters(casters.vertices_m * scale, casters.triangles)
+    light, bias_m = ShadowLight(tuple(np.array(light.position_m) * scale)), default_bias_m(casters)
+    found = cast("cluster_hierarchy", CLUSTERS, samples, casters, light, bias_m)
+    reference = assert_equal_outside_the_bands(found.shadowed, samples, casters, light, bias_m, 0.01)
+    assert 20 < reference.sum() < len(reference)
+    # What lies less than the bias behind a triangle is lit.
+    depth_m = np.full((SMALL.height_px, SMALL.width_px), (5 + 3e-6) * scale)
+    wall, own = samples_at(scaled, depth_m, np.ones_like(depth_m, bool), rng), roof(scaled, 5.0)
+    own = Casters(own.vertices_m * scale, own.triangles)
+    behind = ShadowLight(tuple(np.array(light_behind(scaled).position_m) * scale))
+    assert not cast("cluster_hierarchy", CLUSTERS, wall, own, behind, 1e-5 * scale).shadowed.any()
+
+
+def test_the_reference_knows_no_length():
+    """A directional light shadows a scene of any size."""
+    camera = a_camera(SMALL)
+    samples, casters = surface_samples(camera, 2), soup(camera, np.random.default_rng(2), largest=1.0)
+    light, eye = light_of(camera, "directional", np.random.default_rng(3)), np.array(camera.eye_m)
+    points = view_points_m(samples, samples.valid)
+    found = brute_force(points, casters, light, 1e-4, eye)
+    assert 20 < found.sum() < len(found)
+    large = Casters((casters.vertices_m - eye) * 2.0**50, casters.triangles)
+    assert (brute_force(points * 2.0**50, large, light, 1e-4 * 2.0**50) == found).all()
 
 
 def test_each_edge_is_listed_once_with_its_two_triangles():
@@ -564,6 +614,7 @@ def test_every_variant_on_a_real_scene(technique, plan, frame):
         ("tile_px", 8.5, "a whole number from 1 to 256"),
         ("branching", 1, "a whole number from 2 on"),
         ("batch", -1, "a whole number from 0 on"),
+        ("clusters", 2**25 + 1, "a whole number from 0 to 33554432"),
         ("passes", 3, "a whole number from 1 to 2"),
         ("level", -1, "a whole number from 0 to 24"),
         ("level", 2, "where the first of two passes ends, and this plan has one; give passes=2"),
