@@ -13,11 +13,12 @@ from vtfs.input_error import InputError
 from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan
 from vtfs.shadow_programs import run_program
 from vtfs.shadow_volumes.full_tree import n_cells, require_room
+from vtfs.shadow_volumes.sample_tiles import MAX_BLOCKS
 
 log = logging.getLogger("vtfs.shadows")
 
 _FIRST = ShadowPlan(clusters=2**12, groups=2**10, leaf_groups=2**13)
-_LARGEST = 2**26
+_LARGEST, _LARGEST_OF = 2**26, {"clusters": MAX_BLOCKS}
 _FIRST_LISTS = {"z_pass": 2, "z_fail": 2, "ptsv": 1, "cluster_hierarchy": 1}
 """Lists of a level for each triangle, where the search for capacities begins: each step of it compiles, and on a CPU
 what is too large is written all the same."""
@@ -75,6 +76,7 @@ def fitted_to_all(
     """
     run = run or (lambda plan, i: run_program(technique, plan, frames[i]))
     n_samples = int(np.prod(frames[0].receives.shape))
+    n_clusters = min(n_samples // min(8, plan.tile_px), MAX_BLOCKS)
     n_triangles = frames[0].triangles.shape[0]
     viewport = frames[0].positions.viewport
     if technique == "cluster_hierarchy":
@@ -85,7 +87,7 @@ def fitted_to_all(
         require_room(plan.cells, plan.branching)
     plan = replace(
         plan,
-        clusters=plan.clusters or _rounded_up("clusters", n_samples // min(8, plan.tile_px), _FIRST.clusters),
+        clusters=plan.clusters or _rounded_up("clusters", n_clusters, _FIRST.clusters),
         groups=plan.groups or _rounded_up("lists", _FIRST_LISTS[technique] * n_triangles, _FIRST.groups),
         leaf_groups=plan.leaf_groups
         or _rounded_up("leaf lists", n_samples // _FIRST_SHARE[technique], _FIRST.leaf_groups),
@@ -138,8 +140,9 @@ def _rounded_up(name: str, needed: int, first: int) -> int:
 
     **Raises:** `InputError` where no capacity holds that many.
     """
-    if needed > _LARGEST:
-        raise InputError(f"shadows: {needed:,} {name} needed, at most {_LARGEST:,} fit; use larger tiles or a batch.")
+    largest = _LARGEST_OF.get(name, _LARGEST)
+    if needed > largest:
+        raise InputError(f"shadows: {needed:,} {name} needed, at most {largest:,} fit; use larger tiles or a batch.")
     return max(first, 1 << (max(needed, 1) - 1).bit_length())
 
 

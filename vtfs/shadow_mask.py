@@ -18,6 +18,7 @@ from vtfs.input_error import InputError
 from vtfs.layers import Layers
 from vtfs.shadow_casters import BIAS, Casters, FrontFaces, ShadowLight, welded
 from vtfs.shadow_volumes.planes import Extra, Precision
+from vtfs.shadow_volumes.sample_tiles import MAX_BLOCKS
 
 if TYPE_CHECKING:
     from vtfs.view_samples import ViewSamples
@@ -121,8 +122,9 @@ class ShadowPlan:
 
 _FLAG = (False, True)
 _WHOLE = {
-    "tile_px": (1, 256), "branching": (2, 0), "batch": (0, 0), "passes": (1, 2), "level": (0, 24), "clusters": (0, 0),
-    "groups": (0, 0), "leaf_groups": (0, 0), "pairs": (0, 0), "cells": (0, 0), "nodes": (0, 0),
+    "tile_px": (1, 256), "branching": (2, 0), "batch": (0, 0), "passes": (1, 2), "level": (0, 24),
+    "clusters": (0, MAX_BLOCKS), "groups": (0, 0), "leaf_groups": (0, 0), "pairs": (0, 0), "cells": (0, 0),
+    "nodes": (0, 0),
 }  # fmt: skip
 """Fields of a plan that are whole numbers, with the least and the largest value; 0: no largest one."""
 

@@ -114,8 +114,9 @@ def volume_planes(
     away = -(face @ light[:3]) if light[3] == 0 else (face * a).sum(axis=1)
     # What is seen edge-on up to rounding has no inside: its orientation would be noise.
     size = sum(np.linalg.norm(n, axis=1) * np.linalg.norm(v, axis=1) for n, v in zip(sides, (a, b, c), strict=True))
-    # With a vertex at the light all of that vanishes, and the volume is rounding.
-    size = np.maximum(size, np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1) * np.linalg.norm(a, axis=1))
+    if light[3] != 0:  # with a vertex at the light all of that vanishes, and the volume is rounding
+        edges = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
+        size = np.maximum(size, edges * np.linalg.norm(a, axis=1))
     sign = np.where(np.abs(away) > 1e-12 * size, np.sign(away), 0.0)[:, None]
     height = np.where(sign[:, 0] != 0, (face * a).sum(axis=1) * sign[:, 0], np.inf)
     planes = tuple(n * sign for n in (*sides, face))

@@ -109,6 +109,12 @@ def grid_of(camera: Camera, deepest_m: float, tile_px: int, depth_slices: int) -
     """The same, of a camera whose deepest sample is known."""
     grid = cluster_grid(camera, tile_px, depth_slices, deepest_m)
     n_slices = int(grid.depth_slices)
+    longest_px = max(camera.viewport.width_px, camera.viewport.height_px)
+    if -(-longest_px // tile_px) > 2**KEY_BITS:
+        raise InputError(
+            f"tile_px={tile_px} cuts {longest_px:,} pixels into {-(-longest_px // tile_px):,} tiles along one axis: "
+            f"shadow clusters have at most {2**KEY_BITS:,}; use larger tiles."
+        )
     if n_slices > 2**KEY_BITS:
         raise InputError(
             f"tile_px={tile_px} with depth_slices={depth_slices} makes {n_slices:,} slices: shadow clusters have at "

@@ -9,9 +9,11 @@ import pytest
 
 from tests.strategies import SMALL, a_camera, positions_of, samples_at
 from vtfs.bounds import Aabb
+from vtfs.camera import Viewport
 from vtfs.cluster_grid import depth_slices
 from vtfs.gbuffer import from_runs, to_runs
-from vtfs.shadow_techniques import shadow_grid
+from vtfs.input_error import InputError
+from vtfs.shadow_techniques import grid_of, shadow_grid
 from vtfs.shadow_volumes.full_tree import at_their_keys, keys_of, n_cells
 from vtfs.shadow_volumes.hierarchy import merged_up, node_table
 from vtfs.shadow_volumes.sample_tiles import in_runs, sample_clusters, sample_tiles, tile_order
@@ -65,6 +67,14 @@ def test_clusters_are_the_tiles_and_slices_that_samples_lie_in(tile_px, n_slices
 def morton(column: int, row: int, slice_k: int) -> int:
     parts = (column, row, slice_k)
     return sum((part >> bit & 1) << (3 * bit + k) for bit in range(13) for k, part in enumerate(parts))
+
+
+@pytest.mark.parametrize("viewport", [Viewport(8193, 1), Viewport(1, 16384)])
+def test_more_columns_or_rows_than_a_key_has_bits_for_are_refused(viewport):
+    camera = a_camera(viewport)
+    assert grid_of(camera, 10.0, 2, 1).depth_slices == 1
+    with pytest.raises(InputError, match=r"tile_px=1 cuts [\d,]+ pixels .*at most 8,192"):
+        grid_of(camera, 10.0, 1, 1)
 
 
 def test_a_full_tree_holds_each_cluster_at_a_key_of_its_own():

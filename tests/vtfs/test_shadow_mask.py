@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.strategies import SMALL, a_camera, seeds, surface_samples
+from tests.strategies import SMALL, a_camera, seeds, surface_samples, through
 from tests.vtfs.shadow_cases import (
     CLUSTERS,
     N_TRIANGLES,
@@ -23,6 +23,7 @@ from tests.vtfs.shadow_cases import (
     light_of,
     soup,
 )
+from vtfs.camera import Lens
 from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.shadow_capacities import fitted
@@ -108,6 +109,22 @@ def bad_triangles(kind: str, light_m: np.ndarray, n: int, rng: np.random.Generat
         scale = {"tiny": 1e-30, "huge": 1e30}[kind]
         corners = corners * scale + np.where(rng.random((n, 1, 1)) < 0.5, a[:, None], 0)
     return corners + light_m
+
+
+@pytest.mark.parametrize(
+    ("technique", "plan"), [("cluster_hierarchy", CLUSTERS), ("ptsv", TILES), ("z_pass", CLUSTERS)]
+)
+def test_a_parallel_view_has_the_shadows_that_brute_force_says(technique, plan):
+    n_shadowed = 0
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        camera = a_camera(SMALL)
+        samples, casters = through(surface_samples(camera, seed), Lens(orthographic_height_m=8.0)), balls(camera, rng)
+        light, bias_m = light_of(camera, "inside", rng), default_bias_m(casters)
+        found = cast(technique, plan, samples, casters, light, bias_m)
+        assert_equal_outside_the_bands(found.shadowed, samples, casters, light, bias_m, 0.02)
+        n_shadowed += found.shadowed.sum()
+    assert n_shadowed > 100
 
 
 def test_ten_thousand_bad_triangles_shadow_nothing_that_brute_force_leaves_lit():

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.vtfs.shadow_cases import gallery_case
+from tests.strategies import SMALL, a_camera, surface_samples
+from tests.vtfs.shadow_cases import gallery_case, light_of, soup
 from vtfs.shadow_casters import Casters, ShadowLight
 from vtfs.shadow_mask import default_bias_m, facing_samples
-from vtfs.shadow_references import classify, facing_light, is_excused, view_points_m
+from vtfs.shadow_references import brute_force, classify, facing_light, is_excused, view_points_m
 
 
 def test_a_mask_that_is_wrong_everywhere_is_excused_nowhere():
@@ -44,3 +45,15 @@ def test_mismatches_are_told_apart():
     assert classify(np.array([[0.0, -0.2, -1.0]]), np.ones(1, bool), casters, light, bias_m=1e-4).errors == 1
     assert classify(points, np.zeros(4, bool), casters, light, 1e-4).total == 0
     assert facing_light(casters, light).tolist() == [True]
+
+
+def test_the_reference_knows_no_length():
+    """A directional light shadows a scene of any size."""
+    camera = a_camera(SMALL)
+    samples, casters = surface_samples(camera, 2), soup(camera, np.random.default_rng(2), largest=1.0)
+    light, eye = light_of(camera, "directional", np.random.default_rng(3)), np.array(camera.eye_m)
+    points = view_points_m(samples, samples.valid)
+    found = brute_force(points, casters, light, 1e-4, eye)
+    assert 20 < found.sum() < len(found)
+    large = Casters((casters.vertices_m - eye) * 2.0**50, casters.triangles)
+    assert (brute_force(points * 2.0**50, large, light, 1e-4 * 2.0**50) == found).all()

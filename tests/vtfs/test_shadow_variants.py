@@ -125,6 +125,28 @@ def test_what_lies_less_than_the_bias_behind_a_triangle_is_lit(technique, plan, 
         assert (found.shadowed == is_shadowed).all(), biases
 
 
+@pytest.mark.parametrize("scale", [1e-22, 1e20])
+def test_no_length_is_too_short_or_too_long_for_the_bias(scale):
+    """Squares of these lengths vanish or overflow in float32."""
+    camera, rng = a_camera(SMALL, eye_m=(0.0, 0.0, 0.0)), np.random.default_rng(2)
+    samples, casters = surface_samples(camera, 2), soup(camera, rng, largest=1.0)
+    light = light_of(camera, "inside", rng)
+    scaled = replace(camera, near_m=camera.near_m * scale, far_m=camera.far_m * scale)
+    position_m = (samples.position_m * np.float64(scale)).astype(np.float32)
+    samples = replace(samples, camera=scaled, position_m=position_m)
+    casters = Casters(casters.vertices_m * scale, casters.triangles)
+    light, bias_m = ShadowLight(tuple(np.array(light.position_m) * scale)), default_bias_m(casters)
+    found = cast("cluster_hierarchy", CLUSTERS, samples, casters, light, bias_m)
+    reference = assert_equal_outside_the_bands(found.shadowed, samples, casters, light, bias_m, 0.01)
+    assert 20 < reference.sum() < len(reference)
+    # What lies less than the bias behind a triangle is lit.
+    depth_m = np.full((SMALL.height_px, SMALL.width_px), (5 + 3e-6) * scale)
+    wall, own = samples_at(scaled, depth_m, np.ones_like(depth_m, bool), rng), roof(scaled, 5.0)
+    own = Casters(own.vertices_m * scale, own.triangles)
+    behind = ShadowLight(tuple(np.array(light_behind(scaled).position_m) * scale))
+    assert not cast("cluster_hierarchy", CLUSTERS, wall, own, behind, 1e-5 * scale).shadowed.any()
+
+
 def test_what_blocks_most_of_the_light_is_known():
     """Each face of an octahedron about the light fills an eighth of all directions, whatever its size."""
     corners = np.concatenate([np.eye(3), -np.eye(3)]) * np.array([[1.0], [2], [3], [4], [5], [6]])
@@ -173,6 +195,7 @@ def test_a_restart_level_that_is_not_there_is_refused_by_name():
         ("tile_px", 8.5, "a whole number from 1 to 256"),
         ("branching", 1, "a whole number from 2 on"),
         ("batch", -1, "a whole number from 0 on"),
+        ("clusters", 2**25 + 1, "a whole number from 0 to 33554432"),
         ("passes", 3, "a whole number from 1 to 2"),
         ("level", -1, "a whole number from 0 to 24"),
         ("level", 2, "where the first of two passes ends, and this plan has one; give passes=2"),

@@ -36,8 +36,11 @@ def sample_rows(hierarchy: Hierarchy, volume: Volumes) -> Float[Array, "tiles 4 
     samples = hierarchy.samples
     position = [samples.x_m, samples.y_m, samples.z_m]
     x, y, z = (c.astype(jnp.float64) - o for c, o in zip(position, volume.origin_m, strict=True))
-    squared = (x * x + y * y + z * z).astype(jnp.float32)
-    moved = volume.bias_m.astype(jnp.float32) * jax.lax.rsqrt(squared)
+    # In biases: the square of a distance in metres may overflow or vanish in float32.
+    has_bias = volume.bias_m > 0
+    per_bias = 1 / jnp.where(has_bias, volume.bias_m, 1.0)
+    x, y, z = (c * per_bias for c in (x, y, z))
+    moved = jnp.where(has_bias, jax.lax.rsqrt((x * x + y * y + z * z).astype(jnp.float32)), 0)
     return jnp.stack([*position, moved], axis=1)
 
 

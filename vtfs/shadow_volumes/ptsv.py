@@ -18,8 +18,8 @@ from vtfs.shadow_volumes.walk import walk_volumes as shadow_traverse
 def ptsv(frame: ShadowFrame, plan: ShadowPlan) -> ShadowMask:
     """Shadows by a hierarchy of least and greatest depths.
 
-    A node is a rectangle of the image between two depths; `branching` 32 makes 8 x 4 and 4 x 8 in turn. Its leaves are
-    tiles of `tile_px` squared samples, all of which are tested.
+    A node is a rectangle of the image between two depths, which is a box in a parallel view; `branching` 32 makes 8 x 4
+    and 4 x 8 in turn. Its leaves are tiles of `tile_px` squared samples, all of which are tested.
     """
     volume, hierarchy = shadow_planes(frame, plan), shadow_build(frame, plan)
     return shadow_merge(volume, hierarchy, shadow_traverse(volume, hierarchy, plan))
@@ -33,8 +33,9 @@ def shadow_planes(frame: ShadowFrame, plan: ShadowPlan) -> Volumes:
 def shadow_build(frame: ShadowFrame, plan: ShadowPlan) -> Hierarchy:
     """The depths of all tiles of samples that receive shadow, and the tree over them."""
     samples = sample_tiles(frame.positions, frame.receives, plan.tile_px)
-    table = node_table(depth_parts(samples, frame.grid), plan.branching, is_frustum=True)
-    return over_tiles(samples, table, frame.counted, is_frustum=True)
+    is_frustum = not frame.positions.is_parallel
+    table = node_table(depth_parts(samples, frame.grid, not is_frustum), plan.branching, is_frustum)
+    return over_tiles(samples, table, frame.counted, is_frustum)
 
 
 def over_tiles(samples: SampleTiles, table: NodeTable, counted: Bool[Array, ""], is_frustum: bool) -> Hierarchy:

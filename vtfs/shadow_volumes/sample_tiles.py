@@ -17,6 +17,9 @@ from vtfs.gbuffer import RUN, RUN_HEIGHT_PX, RUN_WIDTH_PX, Positions, runs_acros
 KEY_BITS = 13
 """Of the columns, rows and slices of a cluster's key; the block it came from takes the other 25 bits of 64."""
 
+_PLACE_BITS = 64 - 3 * KEY_BITS
+MAX_BLOCKS = 2**_PLACE_BITS
+
 _PIXEL_SLACK_PX = 0.02  # a user's G-buffer may have positions up to 0.01 pixels outside their own pixel
 
 
@@ -118,10 +121,11 @@ def tile_order(columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
     return tile.astype(np.int32), place_of.astype(np.int32)
 
 
-def depth_parts(samples: SampleTiles, grid: ClusterGrid) -> Aabb:
-    """What each place of `tile_order` covers: slopes x / depth and y / depth, and depths of its samples.
+def depth_parts(samples: SampleTiles, grid: ClusterGrid, is_parallel: bool) -> Aabb:
+    """What each place of `tile_order` covers: its tile, and the depths of its samples.
 
-    Components are x and y slopes and depth; empty where a tile has no samples.
+    Components are x / depth, y / depth and depth; in a parallel view, whose tiles are equally wide everywhere, x, y and
+    z, which is a box. Empty where a tile has no samples.
     """
     tile, _ = tile_order(samples.columns, samples.rows)
     some = samples.receives.any(axis=1)
@@ -132,16 +136,18 @@ def depth_parts(samples: SampleTiles, grid: ClusterGrid) -> Aabb:
     column, row = (tile % samples.columns).astype(np.float32), (tile // samples.columns).astype(np.float32)
     size, slack = samples.tile_px * grid.slope_per_px, np.float32(_PIXEL_SLACK_PX) * grid.slope_per_px
 
+    low_z, high_z = (-farthest, -nearest) if is_parallel else (nearest, farthest)
+
     def kept(value, absent: float):
         return jnp.where(exists, value, jnp.float32(absent))
 
     return Aabb(
         kept(grid.slope_x + column * size - slack, jnp.inf),
         kept(grid.slope_y - (row + 1) * size - slack, jnp.inf),
-        kept(nearest[index], jnp.inf),
+        kept(low_z[index], jnp.inf),
         kept(grid.slope_x + (column + 1) * size + slack, -jnp.inf),
         kept(grid.slope_y - row * size + slack, -jnp.inf),
-        kept(farthest[index], -jnp.inf),
+        kept(high_z[index], -jnp.inf),
     )
 
 
@@ -232,9 +238,6 @@ def sample_clusters(samples: SampleTiles, grid: ClusterGrid, explicit: bool, cap
         )
     of_sample = cluster_of_block[jnp.minimum(block_of_sample, capacity - 1)].reshape(n_tiles, lanes)
     return SampleClusters(cluster_tile, cluster_slice, box, n_clusters, of_sample, members, n_blocks)
-
-
-_PLACE_BITS = 64 - 3 * KEY_BITS
 
 
 def _spread(value: Int[Array, "*n"]) -> UInt64[Array, "*n"]:

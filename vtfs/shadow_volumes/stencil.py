@@ -121,14 +121,16 @@ def count_polygons(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> tu
 
 
 def shadow_planes(frame: ShadowFrame, plan: ShadowPlan, by_failing: bool) -> StencilPolygons:
-    """Sides and, by failing, caps of all volumes, relative to the eye."""
+    """Sides and, where a line from the eye to a sample may cross them, caps of all volumes, relative to the eye."""
     origin = frame.eye_m
     vertex = rotated(frame, tuple(c - origin[k] for k, c in enumerate(frame.vertex_m)))
     light, apex, zero = light_m(frame), origin_m(frame), jnp.float64(0)
     about_light = tuple(c - o for c, o in zip(vertex, apex, strict=True))
     planes, inward = edge_planes(about_light, frame.triangles, light, frame.directional, zero, frame.culls_front)
     inward = inward[:-1]
-    polygons = _polygons(frame, vertex, light, apex, inward, by_failing)
+    # A parallel view sees samples that have casters between them and its eye.
+    with_caps = by_failing or frame.positions.is_parallel
+    polygons = _polygons(frame, vertex, light, apex, inward, with_caps)
     around_eye = jnp.sum(inside(planes, tuple(-o for o in apex), zero), dtype=jnp.int32)
     return StencilPolygons(polygons, inward != 0, around_eye)
 
