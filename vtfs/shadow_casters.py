@@ -23,6 +23,9 @@ FARTHEST_EXTENTS = 1e5
 out, as float64 cannot tell on which side of them the light is; from there on these are wider than the 1e-5 of the
 extent within which rounding may decide. A directional light then casts the same shadow, within these 1e-5."""
 
+LARGEST_M = 1e36
+"""Of a coordinate: boxes about a point light are float32, in which twice that distance and its rounding must fit."""
+
 FrontFaces = Literal["cast", "culled"]
 
 
@@ -54,7 +57,7 @@ class Casters:
                 "repair the mesh."
             )
         largest = float(np.abs(self.vertices_m[self.triangles]).max())
-        if largest > 1e36:
+        if largest > LARGEST_M:
             raise InputError(f"casters `vertices_m`: a coordinate of {largest:g} m is beyond 1e36; scale the scene.")
 
     @property
@@ -124,7 +127,8 @@ class ShadowLight:
 
 
 def require_near(light: ShadowLight, casters: Casters) -> None:
-    """**Raises:** `InputError` for a point light further than `FARTHEST_EXTENTS` from casters that have an extent."""
+    """**Raises:** `InputError` for a point light further than `FARTHEST_EXTENTS` from casters that have an extent, or
+    beyond `LARGEST_M`."""
     if light.directional or not casters.extent_m:
         return
     low, high = casters.box_m
@@ -135,6 +139,10 @@ def require_near(light: ShadowLight, casters: Casters) -> None:
             f"shadow light `position_m` = ({', '.join(f'{c:g}' for c in place)}): is {distance_m:g} m from casters of "
             f"{casters.extent_m:g} m, and must be within {FARTHEST_EXTENTS:g} of their extents, beyond which float64 "
             "cannot tell small triangles apart; make it a directional light."
+        )
+    if np.abs(place).max() > LARGEST_M:
+        raise InputError(
+            f"shadow light `position_m`: a coordinate of {np.abs(place).max():g} m is beyond 1e36; scale the scene."
         )
 
 

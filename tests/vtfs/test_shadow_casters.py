@@ -89,6 +89,8 @@ def test_a_light_is_refused_where_rounding_would_decide_more_than_the_bands_excu
         ):
             n_cast(distance_m, casters)
     assert n_cast(1e30, Casters(np.zeros((0, 3)), np.zeros((0, 3), np.int32))) == 0
+    with pytest.raises(InputError, match=r"`position_m`: a coordinate of 1e\+37 m is beyond 1e36"):
+        n_cast(1e37, Casters(corners * 1e35, casters.triangles))  # boxes about it would overflow
 
 
 @pytest.mark.parametrize(
