@@ -125,6 +125,19 @@ def test_what_lies_less_than_the_bias_behind_a_triangle_is_lit(technique, plan, 
         assert (found.shadowed == is_shadowed).all(), biases
 
 
+def test_a_stencil_keeps_a_bias_that_float32_would_lose():
+    """A fiftieth of what tells two float32 depths apart. Not by z-pass: no eye sees behind the roof."""
+    camera, bias_m = a_camera(SMALL), 1e-8
+    depth_m = np.full((SMALL.height_px, SMALL.width_px), 5.0)
+    samples, light = (
+        samples_at(camera, depth_m, np.ones_like(depth_m, bool), np.random.default_rng(0)),
+        light_behind(camera),
+    )
+    for biases, is_shadowed in ((0.3, False), (1.5, True)):
+        found = cast("z_fail", CLUSTERS, samples, roof(camera, 5.0 - biases * bias_m), light, bias_m)
+        assert (found.shadowed == is_shadowed).all(), biases
+
+
 @pytest.mark.parametrize("scale", [1e-22, 1e20])
 def test_no_length_is_too_short_or_too_long_for_the_bias(scale):
     """Squares of these lengths vanish or overflow in float32."""

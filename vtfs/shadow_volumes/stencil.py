@@ -185,11 +185,14 @@ _LARGEST = 255
 
 
 def _moved(frame: ShadowFrame, light: Vector) -> Positions:
-    """The samples, each moved toward the light by the bias, at most onto it."""
+    """The samples, each moved toward the light by the bias, at most onto it.
+
+    In float64: where a light grazes a surface the bias lifts them by less than float32 can tell.
+    """
     at = tuple(c.astype(jnp.float64) for c in (frame.positions.x_m, frame.positions.y_m, frame.positions.z_m))
     way = light if frame.directional else minus(light, at)
     share = frame.bias_m / jnp.maximum(length(way), frame.bias_m) if not frame.directional else frame.bias_m
-    x, y, z = ((a + share * w).astype(jnp.float32) for a, w in zip(at, way, strict=True))
+    x, y, z = (a + share * w for a, w in zip(at, way, strict=True))
     return replace(frame.positions, x_m=x, y_m=y, z_m=z)
 
 
