@@ -16,9 +16,18 @@ import numpy as np
 from vtfs.camera import Camera, CameraPath, Pose, Viewport, load_cameras
 from vtfs.gallery import GALLERY, build_scene
 from vtfs.scene import Material, Scene, load_scene
-from vtfs.shadow_casters import Casters, ShadowLight
-from vtfs.shadow_mask import ShadowFrame, ShadowMask, ShadowPlan, default_bias_m, facing_samples
+from vtfs.shadow_casters import Casters, FrontFaces, ShadowLight
+from vtfs.shadow_mask import (
+    CastersOnDevice,
+    ShadowFrame,
+    ShadowMask,
+    ShadowPlan,
+    default_bias_m,
+    facing_samples,
+    shadow_frame,
+)
 from vtfs.shadow_programs import counting_program
+from vtfs.shadow_techniques import shadow_grid
 from vtfs.view_samples import ViewSamples, trace_view_samples
 
 LIGHT = ShadowLight((10.0, 30.0, -20.0))
@@ -115,6 +124,13 @@ class Case:
     light: ShadowLight
     receives: np.ndarray
     bias_m: float
+
+    def frame(
+        self, casters: CastersOnDevice, tile_px: int, depth_slices: int = 0, front_faces: FrontFaces = "cast"
+    ) -> ShadowFrame:
+        """What a technique takes; `casters` are its own, sent once."""
+        grid = shadow_grid(self.samples, tile_px, depth_slices)
+        return shadow_frame(self.samples, casters, self.light, grid, self.bias_m, self.receives, front_faces)
 
 
 @functools.lru_cache

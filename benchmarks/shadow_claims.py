@@ -33,9 +33,8 @@ from vtfs.files import write_atomically
 from vtfs.shadow_capacities import fitted_to_all
 from vtfs.shadow_casters import FrontFaces
 from vtfs.shadow_counts import shadow_counts
-from vtfs.shadow_mask import ShadowPlan, casters_on_device, shadow_frame
+from vtfs.shadow_mask import ShadowPlan, casters_on_device
 from vtfs.shadow_programs import shadow_program
-from vtfs.shadow_techniques import shadow_grid
 
 PAPER = ShadowPlan(tile_px=8, branching=32, feedback=False)
 SILHOUETTE, NO_PLANES = replace(PAPER, extra="silhouette"), replace(PAPER, extra="off")
@@ -120,11 +119,7 @@ CLAIMS = (
 def counted(run: Run, case: Case, one_at_once: threading.Lock) -> dict[str, float]:
     """Counts of a run; `one_at_once` holds what runs on the device."""
     plan = run.plan
-    casters = casters_on_device(case.casters)
-    grid = shadow_grid(case.samples, plan.tile_px, run.depth_slices)
-    frame = shadow_frame(
-        case.samples, casters, case.light, grid, case.bias_m, case.receives, front_faces=run.front_faces
-    )
+    frame = case.frame(casters_on_device(case.casters), plan.tile_px, run.depth_slices, run.front_faces)
     plan = with_room(plan, case.casters.n_triangles, times=2)
     if jax.default_backend() != "cpu" and run.technique in ("z_pass", "z_fail"):
         plan = replace(plan, leaf_groups=4 * plan.leaf_groups)
@@ -173,10 +168,7 @@ def _row_of_times(line: dict) -> str:
 def path_times_ms(plan: ShadowPlan, cases: list[Case], turns: int = 5) -> list[list[float]]:
     """Times of each frame, from view samples to mask: one program, with capacities that hold all of them, in turns."""
     casters = casters_on_device(cases[0].casters)
-    frames = [
-        shadow_frame(one.samples, casters, one.light, shadow_grid(one.samples, plan.tile_px), one.bias_m, one.receives)
-        for one in cases
-    ]
+    frames = [one.frame(casters, plan.tile_px) for one in cases]
     plan, _ = fitted_to_all("cluster_hierarchy", with_room(plan, cases[0].casters.n_triangles), frames)
     times: list[list[float]] = [[] for _ in frames]
     with jax.enable_x64(True):

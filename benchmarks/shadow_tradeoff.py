@@ -32,9 +32,8 @@ from vtfs.gbuffer import from_runs
 from vtfs.input_error import InputError
 from vtfs.shadow_capacities import fitted_to_all, shadow_sizes, with_shadow_sizes
 from vtfs.shadow_counts import shadow_counts
-from vtfs.shadow_mask import CastersOnDevice, ShadowFrame, ShadowPlan, casters_on_device, shadow_frame
+from vtfs.shadow_mask import CastersOnDevice, ShadowFrame, ShadowPlan, casters_on_device
 from vtfs.shadow_programs import shadow_program
-from vtfs.shadow_techniques import shadow_grid
 from vtfs.shadow_volumes.sample_tiles import KEY_BITS
 
 BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (4, 16, 2, 32)
@@ -115,14 +114,11 @@ class Ready:
 
 def frame_of(subject: Subject, variant: Variant) -> tuple[ShadowFrame, int]:
     """The view for a variant, and its slices; 0: cubic cells."""
-    case, tile_px, depth_slices = subject.case, variant.plan.tile_px, variant.depth_slices
+    tile_px, depth_slices = variant.plan.tile_px, variant.depth_slices
     try:
-        grid = shadow_grid(case.samples, tile_px, depth_slices)
+        return subject.case.frame(subject.casters, tile_px, depth_slices), depth_slices
     except InputError:  # cubic cells as narrow as such tiles are more than keys can tell apart
-        depth_slices = 2**KEY_BITS
-        grid = shadow_grid(case.samples, tile_px, depth_slices)
-    frame = shadow_frame(case.samples, subject.casters, case.light, grid, case.bias_m, case.receives)
-    return frame, depth_slices
+        return subject.case.frame(subject.casters, tile_px, 2**KEY_BITS), 2**KEY_BITS
 
 
 def sizes_of(subject: Subject, variant: Variant, frame: ShadowFrame, one_at_once: threading.Lock) -> dict:
@@ -135,19 +131,21 @@ def sizes_of(subject: Subject, variant: Variant, frame: ShadowFrame, one_at_once
     return plans | {"counts": shadow_counts(sized, frame, looped)}
 
 
-def prepare(
-    key: str, subject: Subject, variant: Variant, sizes: RunLines, only_sizes: bool, one_at_once: threading.Lock
-) -> Ready | None:
+def sized(subject: Subject, variant: Variant, frame: ShadowFrame, known: RunLines, one_at_once: threading.Lock) -> dict:
+    """The line of `known` that has the sizes of a variant, made if it is not there."""
+    key = f"{subject.case.name}: {variant.name}"
+    found = known.known().get(key)
+    if found is None:
+        found = {"key": key, "sized_on": device_name(), **sizes_of(subject, variant, frame, one_at_once)}
+        known.add(found)
+    return found
+
+
+def compiled(key: str, subject: Subject, variant: Variant, sizes: RunLines, one_at_once: threading.Lock) -> Ready:
     """Size and compile."""
     started = time.monotonic()
     frame, depth_slices = frame_of(subject, variant)
-    size_key = f"{subject.case.name}: {variant.name}"
-    found = sizes.known().get(size_key)
-    if found is None:
-        found = {"key": size_key, "sized_on": device_name(), **sizes_of(subject, variant, frame, one_at_once)}
-        sizes.add(found)
-    if only_sizes:
-        return None
+    found = sized(subject, variant, frame, sizes, one_at_once)
     plan = with_shadow_sizes(variant.plan, tuple(found["looped" if jax.default_backend() == "cpu" else "unrolled"]))
     with jax.enable_x64(True):
         program = shadow_program(variant.technique, plan).lower(frame).compile()
@@ -244,9 +242,11 @@ def main() -> None:
 
     def compile_one(task: tuple[str, Subject, Variant]) -> None:
         try:
-            one = prepare(*task, sizes, given.only_sizes, one_at_once)
-            if one:
-                ready.append(one)
+            if given.only_sizes:
+                _, subject, variant = task
+                sized(subject, variant, frame_of(subject, variant)[0], sizes, one_at_once)
+            else:
+                ready.append(compiled(*task, sizes, one_at_once))
         except Exception as error:  # one that fails is a line too, and the others go on
             lines.add({"key": task[0], "failed": why(error)})
             print(f"{task[0]}: failed: {why(error)}", flush=True)

@@ -32,10 +32,9 @@ from vtfs.files import write_atomically
 from vtfs.gbuffer import from_runs
 from vtfs.shadow_capacities import fitted
 from vtfs.shadow_counts import shadow_counts
-from vtfs.shadow_mask import CastersOnDevice, ShadowFrame, ShadowMask, ShadowPlan, casters_on_device, shadow_frame
+from vtfs.shadow_mask import CastersOnDevice, ShadowFrame, ShadowMask, ShadowPlan, casters_on_device
 from vtfs.shadow_programs import run_program, shadow_program
 from vtfs.shadow_references import ShadowRays, brute_force, classify, view_points_m
-from vtfs.shadow_techniques import shadow_grid
 
 N_CHECKED, N_CLASSIFIED = 2_000, 400
 BRANCHINGS, TILES = (8, 32, 4, 16, 2, 64), (8, 16, 4, 32, 2)
@@ -97,8 +96,7 @@ class Prepared:
 
 def prepare(case: Case, casters: CastersOnDevice, technique: str, plan: ShadowPlan) -> Prepared:
     started = time.perf_counter()
-    grid = shadow_grid(case.samples, plan.tile_px)
-    frame = shadow_frame(case.samples, casters, case.light, grid, case.bias_m, case.receives)
+    frame = case.frame(casters, plan.tile_px)
     plan = fitted(technique, plan, frame)
     counted = run_program(technique, plan, frame)
     with jax.enable_x64(True):
