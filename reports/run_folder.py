@@ -54,6 +54,11 @@ class Gain:
         """True where the interval does not leave 1 behind, so that nothing was gained for certain."""
         return self.interval[0] <= 1.0 if self.interval else self.ratio <= 1.0
 
+    @property
+    def is_loss(self) -> bool:
+        """True where the whole interval lies below 1: no noise, the best configuration is slower."""
+        return self.interval is not None and self.interval[1] < 1.0
+
 
 @dataclass(frozen=True)
 class Prediction:

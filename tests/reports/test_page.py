@@ -158,6 +158,15 @@ def test_a_gain_inside_the_noise_is_said(tmp_path):
     assert "inside the noise" in text
 
 
+def test_a_loss_is_not_called_noise(tmp_path):
+    files = run_inside_the_noise()
+    files.result["fastest_default"] |= {"technique": "forward", "params": {}}
+    files.result["gain"] |= {"over_fastest_default": 0.88, "over_fastest_default_interval": [0.73, 0.95]}
+    text = Reader(page_of(files, tmp_path)).text
+    assert "1.02× (0.98 to 1.06) as fast as its own defaults, inside the noise," in text
+    assert "0.88× (0.73 to 0.95) as fast as the fastest default, that of forward, which is slower," in text
+
+
 def test_a_single_measurement_is_a_report(tmp_path):
     text = Reader(page_of(run_of_one(), tmp_path)).text
     assert "Keep the default: volume_tiled_bvh" in text
