@@ -10,7 +10,7 @@ from vtfs.bit_lists import pack_bits
 from vtfs.node_lists import NodeLists, owners
 from vtfs.shadow_mask import ShadowPlan
 from vtfs.shadow_volumes.hierarchy import Hierarchy
-from vtfs.shadow_volumes.planes import Vector, inside
+from vtfs.shadow_volumes.planes import Vector, inside, length
 from vtfs.shadow_volumes.volumes import Volumes
 
 _SAMPLES_AT_ONCE = {"cpu": 2**18}
@@ -36,12 +36,9 @@ def sample_rows(hierarchy: Hierarchy, volume: Volumes) -> Float[Array, "tiles 4 
     samples = hierarchy.samples
     position = [samples.x_m, samples.y_m, samples.z_m]
     x, y, z = (c.astype(jnp.float64) - o for c, o in zip(position, volume.origin_m, strict=True))
-    # In biases: the square of a distance in metres may overflow or vanish in float32.
-    has_bias = volume.bias_m > 0
-    per_bias = 1 / jnp.where(has_bias, volume.bias_m, 1.0)
-    x, y, z = (c * per_bias for c in (x, y, z))
-    moved = jnp.where(has_bias, jax.lax.rsqrt((x * x + y * y + z * z).astype(jnp.float32)), 0)
-    return jnp.stack([*position, moved], axis=1)
+    # In float64: the square of a distance in metres may overflow or vanish in float32.
+    moved = jnp.where(volume.bias_m > 0, volume.bias_m / length((x, y, z)), 0.0)
+    return jnp.stack([*position, moved.astype(jnp.float32)], axis=1)
 
 
 def _about_light(row: Float[Array, "n 4 *lanes"], volume: Volumes) -> Vector:
